@@ -1,0 +1,35 @@
+# make train | test | lint | bench: each sets up .venv first. PYTHON=... chooses the interpreter; PIP_ARGS=... goes to pip.
+SHELL := /bin/bash
+PYTHONS := $(PYTHON) python3.11 python3.12 python3
+BASE := $(shell for p in $(PYTHONS); do $$p -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null && echo $$p && break; done)
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.PHONY: venv train test lint format bench
+
+venv: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(BASE)" || { echo "error: no Python 3.11 or 3.12 found (tried: $(PYTHONS)). Install one, or: make PYTHON=/path/to/python3.11"; exit 1; }
+	test -x $(BIN)/python || $(BASE) -m venv .venv
+	$(BIN)/python -m pip install -q --disable-pip-version-check $(PIP_ARGS) -c constraints.txt "$$(grep -m1 '^torch==' constraints.txt)"
+	$(BIN)/python -m pip install -q --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+	@touch $(STAMP)
+
+train: venv
+	$(BIN)/python train.py $(ARGS)
+
+test: venv
+	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 $(ARGS)
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: venv
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: venv
+	$(BIN)/python -m pytest -q -s -m benchmark tests/benchmarks $(ARGS)

@@ -1,0 +1,84 @@
+"""Checkpoints: written atomically, read with ``weights_only``, refused with a reason when they do not fit."""
+
+import os
+from pathlib import Path
+
+import torch
+
+FORMAT = 1
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, unreadable or of another world; the message says which and what to do."""
+
+
+def save_checkpoint(path: Path, content: dict) -> Path:
+    """Write ``content`` (tensors, numbers, strings, lists, dicts) so that ``path`` is complete or absent.
+
+    Args:
+        path: file to write.
+        content: what to keep; ``format`` is added.
+
+    Returns:
+        The path.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        torch.save({"format": FORMAT, **content}, file)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    return path
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict:
+    """Read a checkpoint.
+
+    Raises:
+        CheckpointError: if the file is missing, truncated, foreign or of another format.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path} does not exist: give the folder of a run that has written one.")
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files
+        raise CheckpointError(
+            f"checkpoint {path} cannot be read ({type(error).__name__}): it is damaged or not a checkpoint of this project. "
+            "Use another file of its folder."
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else None
+        raise CheckpointError(f"checkpoint {path} has format {found}, this version reads format {FORMAT}: train again.")
+    return content
+
+
+def latest_checkpoint(run: Path) -> Path:
+    """Newest checkpoint of a run folder.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    found = sorted((run / "checkpoints").glob("*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
+    if not found:
+        raise CheckpointError(f"run={run} has no checkpoint in {run / 'checkpoints'}: give the folder of a run that wrote one.")
+    return found[-1]
+
+
+def check_world(path: Path, found: dict, needed: dict) -> None:
+    """Compare the sizes that a checkpoint's networks were made for with the world they are to be used in.
+
+    Args:
+        path: for the message.
+        found: sizes stored in the checkpoint.
+        needed: sizes of the present world.
+
+    Raises:
+        CheckpointError: naming each size that differs.
+    """
+    different = [f"{name} is {found.get(name)} there, {value} here" for name, value in needed.items() if found.get(name) != value]
+    if different:
+        raise CheckpointError(
+            f"checkpoint {path} is of another world: {'; '.join(different)}. Use the world that the run was trained in "
+            "(leave env out), or train in this one."
+        )

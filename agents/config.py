@@ -1,0 +1,67 @@
+"""Parameters of the learner, validated when they are built."""
+
+from dataclasses import dataclass, field
+
+from envs.config import check_choice, check_range
+
+
+@dataclass
+class AgentConfig:
+    """MADDPG and its independent case DDPG."""
+
+    algorithm: str = "maddpg"
+    """maddpg: centralised critics Q_i(s, a_1..a_N). ddpg: independent critics Q_i(o_i, a_i)."""
+    actor_cells: list[int] = field(default_factory=lambda: [64, 64])
+    """Hidden units of every actor, layer by layer, 1..4096 each."""
+    critic_cells: list[int] = field(default_factory=lambda: [64, 64])
+    """Hidden units of every critic, layer by layer, 1..4096 each."""
+    share_params: bool = False
+    """One actor and one critic for all robots instead of one each."""
+    actor_lr: float = 3e-4
+    """Learning rate of the actors (Adam), (0, 1]."""
+    critic_lr: float = 1e-3
+    """Learning rate of the critics (Adam), (0, 1]."""
+    gamma: float = 0.95
+    """Discount per step, [0, 1)."""
+    tau: float = 0.01
+    """Soft update of the target networks, (0, 1]."""
+    gradient: str = "per_agent"
+    """per_agent: robot i's actor gradient recomputes only its own action, the others' come from the replay sample (the paper).
+    shared: all actions are recomputed and every critic's gradient reaches every actor (TorchRL's stock loss)."""
+    minibatch: str = "shared"
+    """shared: one minibatch for all robots. per_agent: every robot samples its own (the paper)."""
+    noise: str = "gaussian"
+    """Exploration noise, added before the filter: gaussian | ou (Ornstein-Uhlenbeck)."""
+    noise_initial: float = 0.6
+    """Standard deviation of the noise at the start, share of max_speed, [0, 10]."""
+    noise_final: float = 0.1
+    """Standard deviation of the noise at the end of the annealing, share of max_speed, [0, 10]."""
+    noise_frames: int = 500_000
+    """World-steps over which the noise falls linearly, >= 0 (0 = noise_final from the start)."""
+    ou_theta: float = 0.15
+    """ou: mean reversion per step, (0, 1]."""
+    max_grad_norm: float = 0.0
+    """Clip the gradient norm of all actors and of all critics to this, >= 0 (0 = off)."""
+    correction_penalty: float = 0.0
+    """Weight of ||u - u^||^2 / max_speed^2 in the actor loss, >= 0; needs safety.in_loss=true."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_choice("agent.algorithm", self.algorithm, ("maddpg", "ddpg"))
+        for name in ("actor_cells", "critic_cells"):
+            cells = getattr(self, name)
+            if not cells:
+                raise ValueError(f"agent.{name}=[] is empty: give the hidden units of at least one layer, such as [64,64].")
+            for cell in cells:
+                check_range(f"agent.{name}", cell, 1, 4096)
+        for name in ("actor_lr", "critic_lr", "tau", "ou_theta"):
+            check_range(f"agent.{name}", getattr(self, name), 0, 1, open_low=True)
+        check_range("agent.gamma", self.gamma, 0, 0.999999, hint="The discount must be below 1.")
+        check_choice("agent.gradient", self.gradient, ("per_agent", "shared"))
+        check_choice("agent.minibatch", self.minibatch, ("shared", "per_agent"))
+        check_choice("agent.noise", self.noise, ("gaussian", "ou"))
+        for name in ("noise_initial", "noise_final"):
+            check_range(f"agent.{name}", getattr(self, name), 0, 10)
+        check_range("agent.noise_frames", self.noise_frames, 0, 10**12)
+        check_range("agent.max_grad_norm", self.max_grad_norm, 0, 1e6)
+        check_range("agent.correction_penalty", self.correction_penalty, 0, 1e6)

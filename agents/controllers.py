@@ -1,0 +1,177 @@
+"""Controllers that are not learned: nominal policies to compare with. Each writes ("agents", "nominal_action")."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from envs import SurveillanceConfig, keys
+from envs.coverage import coverage_cost, coverage_gradient, voronoi_moments
+from envs.density import Density
+from envs.dynamics import limit_speed
+from envs.homing import homing_velocity, reserve
+from safety import SafetyConfig, SafetyFilter
+
+
+class Controller(TensorDictModuleBase):
+    """Base of all controllers: a pure function of the states (and of an own generator for the random ones).
+
+    Args:
+        world: the world.
+        seed: seed of the controller's generator.
+    """
+
+    def __init__(self, world: SurveillanceConfig, seed: int = 0) -> None:
+        super().__init__()
+        self.world = world
+        self.seed = seed
+        self.geometry = world.homing
+        self.in_keys = [keys.POSITION, keys.ENERGY, keys.SLOT]
+        self.out_keys = [keys.NOMINAL_ACTION]
+        self._on: dict[torch.device, tuple[Density, Tensor, torch.Generator]] = {}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the nominal action."""
+        tensordict.set(keys.NOMINAL_ACTION, self.act(tensordict))
+        return tensordict
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """Nominal action ``(*B, N, d)``, m/s."""
+        raise NotImplementedError
+
+    def tools(self, like: Tensor) -> tuple[Density, Tensor, torch.Generator]:
+        """Density, slots ``(S, d)`` and generator on the device of ``like``."""
+        if like.device not in self._on:
+            slots = torch.tensor(self.world.slot_positions, dtype=self.world.torch_dtype, device=like.device)
+            generator = torch.Generator(device=like.device).manual_seed(self.seed)
+            self._on[like.device] = (Density(self.world, like.device), slots, generator)
+        return self._on[like.device]
+
+    def weights(self, tensordict: TensorDictBase) -> tuple[Density, Tensor]:
+        """Density and the present weights of its quadrature points."""
+        position = tensordict[keys.POSITION]
+        density, _, _ = self.tools(position)
+        params = tensordict[keys.DENSITY] if density.n_params else position.new_zeros(*position.shape[:-2], 0)
+        return density, density.weights(params)
+
+
+class Random(Controller):
+    """Uniform in the speed ball, drawn anew each step."""
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """See the class."""
+        position = tensordict[keys.POSITION]
+        _, _, generator = self.tools(position)
+        factory = {"generator": generator, "dtype": position.dtype, "device": position.device}
+        direction = torch.randn(position.shape, **factory)
+        direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+        share = torch.rand((*position.shape[:-1], 1), **factory) ** (1 / position.shape[-1])
+        return self.world.max_speed * share * direction
+
+
+class Lloyd(Controller):
+    """Drive to the centroid of the own Voronoi cell, as fast as one step allows. Knows nothing of batteries."""
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """See the class."""
+        position = tensordict[keys.POSITION]
+        density, weights = self.weights(tensordict)
+        _, centroid = voronoi_moments(position, density.points, weights)
+        return limit_speed((centroid - position) / self.world.dt, self.world.max_speed)
+
+
+class ChargeWhenLow(Lloyd):
+    """Lloyd until the energy nears the reserve, then home, and stay until nearly full.
+
+    The hysteresis needs no memory: a robot inside its slot's charging radius that is not full stays.
+    """
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """See the class."""
+        world, geometry = self.world, self.geometry
+        position, energy = tensordict[keys.POSITION], tensordict[keys.ENERGY].squeeze(-1)
+        _, slots, _ = self.tools(position)
+        slot_position = slots[tensordict[keys.SLOT].squeeze(-1)]
+        distance = (position - slot_position).norm(dim=-1)
+        span = world.energy_max - world.energy_min
+        low = energy - world.energy_min - reserve(distance, geometry) <= 0.15 * span
+        charging = (distance <= geometry.charge_radius) & (energy < world.energy_max - 0.1 * span)
+        home = homing_velocity(position, slot_position, geometry)
+        return torch.where((low | charging).unsqueeze(-1), home, super().act(tensordict))
+
+
+class CoverageCBF(Controller):
+    """The literature's coverage controller: task barrier ``h_t = -J`` with slack.
+
+    ``min sum ||u_i||^2 + kappa delta^2  s.t.  -grad J . u >= alpha J - delta``; as J > 0 the row is always active, so
+    ``u = -kappa alpha J grad J / (1 + kappa ||grad J||^2)``, cut to the speed limit. Nominal for any filter.
+
+    Source: the paper, section III.B; Notomista & Egerstedt, arXiv 1903.05810.
+    """
+
+    kappa = 1e3
+    alpha = 1.0
+
+    def gradient(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """``J (*B, 1, 1)`` and ``grad J (*B, N, d)``."""
+        position = tensordict[keys.POSITION]
+        density, weights = self.weights(tensordict)
+        cost = coverage_cost(position, density.points, weights, density.cell_moment)
+        return cost[..., None, None], coverage_gradient(position, density.points, weights)
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """See the class."""
+        cost, gradient = self.gradient(tensordict)
+        squared = gradient.square().sum((-2, -1), keepdim=True)
+        action = -self.kappa * self.alpha * cost * gradient / (1 + self.kappa * squared)
+        return limit_speed(action, self.world.max_speed)
+
+
+class CoverageCBFLiteral(CoverageCBF):
+    """:class:`CoverageCBF` with the survivability and collision rows in the same joint quadratic program.
+
+    Hessian ``I + kappa grad J grad J^T`` once the slack is eliminated. A problem without solution holds (u = 0).
+    Run it with ``safety=none`` for the literature's controller as it stands.
+    """
+
+    def __init__(self, world: SurveillanceConfig, seed: int = 0) -> None:
+        super().__init__(world, seed)
+        self.rows = SafetyFilter(SafetyConfig(split="joint", sampled_data=False), world)
+
+    def act(self, tensordict: TensorDictBase) -> Tensor:
+        """See the class."""
+        cost, gradient = self.gradient(tensordict)
+        flat = gradient.flatten(-2)
+        identity = torch.eye(flat.shape[-1], dtype=flat.dtype, device=flat.device)
+        Q = identity + self.kappa * flat.unsqueeze(-1) * flat.unsqueeze(-2)
+        p = self.kappa * self.alpha * cost.squeeze(-1) * flat
+        position, energy, slot = (tensordict[key] for key in (keys.POSITION, keys.ENERGY, keys.SLOT))
+        return self.rows.solve_task(Q, p, position, energy.squeeze(-1), slot.squeeze(-1))
+
+
+CONTROLLERS: dict[str, type[Controller]] = {
+    "random": Random,
+    "lloyd": Lloyd,
+    "charge_when_low": ChargeWhenLow,
+    "coverage_cbf": CoverageCBF,
+    "coverage_cbf_literal": CoverageCBFLiteral,
+}
+
+
+def make_controller(name: str, config: SurveillanceConfig, seed: int = 0) -> Controller:
+    """Controller by name.
+
+    Args:
+        name: one of :data:`CONTROLLERS`.
+        config: the world.
+        seed: seed of the controller's own generator.
+
+    Returns:
+        A TensorDictModule that writes ("agents", "nominal_action").
+
+    Raises:
+        ValueError: if the name is unknown.
+    """
+    if name not in CONTROLLERS:
+        raise ValueError(f"controller={name!r} is unknown: choose one of {', '.join(CONTROLLERS)}.")
+    return CONTROLLERS[name](config, seed)

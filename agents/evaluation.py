@@ -1,0 +1,122 @@
+"""Deterministic rollouts of a policy in many worlds, measured as they run (nothing is stored but one world's history)."""
+
+import math
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import step_mdp
+
+from envs import SurveillanceEnv, keys
+from envs.metrics import ChargeCounter, minimum_distance
+from envs.rendering import Trajectory
+from safety.statistics import FilterStatistics
+
+RECORD_LIMIT = 2000  # samples of the recorded world; longer rollouts keep every n-th
+
+
+@torch.no_grad()
+def evaluate_policy(
+    env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, *, record: bool = False
+) -> tuple[dict, dict, Trajectory | None]:
+    """Roll a filtered policy out from fresh start states; a world counts until it terminates (a time limit does not end it).
+
+    Args:
+        env: the worlds; reset here.
+        policy: writes ("agents", "action") and the filter's diagnostics.
+        steps: length of the rollout.
+        record: keep the history of the first world.
+
+    Returns:
+        Metrics (the block ``eval`` of summary.json), the filter's statistics and the history, if recorded.
+    """
+    config = env.config
+    td = env.reset()
+    alive = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
+    total = {name: torch.zeros((), dtype=torch.float64, device=env.device) for name in ("cost", "reward", "worlds")}
+    violations = {kind: torch.zeros((), dtype=torch.int64, device=env.device) for kind in keys.VIOLATION_KINDS}
+    energy_margin = distance_margin = torch.full((), math.inf, dtype=config.torch_dtype, device=env.device)
+    charges = ChargeCounter(td[keys.ENERGY].squeeze(-1), config)
+    statistics = FilterStatistics(config.max_speed)
+    history = _History(env, every=math.ceil(steps / RECORD_LIMIT)) if record else None
+    for k in range(steps):
+        td = env.step(policy(td))
+        following = td["next"]
+        energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
+        total["worlds"] += alive.sum()
+        total["cost"] += torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64)
+        total["reward"] += torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64)
+        for kind in violations:
+            violations[kind] += (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
+        margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
+        energy_margin = torch.minimum(energy_margin, torch.where(alive, margin, math.inf).min())
+        gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
+        distance_margin = torch.minimum(distance_margin, torch.where(alive.squeeze(-1), gap, math.inf).min())
+        charges.update(energy, next_energy, alive)
+        statistics.update(td, alive)
+        if history is not None:
+            history.add(k, td)
+        alive = alive & ~following["terminated"]
+        td = step_mdp(td)
+    metrics = {
+        "coverage_cost": float(total["cost"] / total["worlds"].clamp_min(1)),
+        "episode_reward": float(total["reward"] / env.batch_size.numel()),
+        "violations": {kind: int(count) for kind, count in violations.items()},
+        "charges_per_robot": float(charges.count.to(torch.float64).mean()),
+        "min_energy_margin": _finite(energy_margin),
+        "min_distance_margin": _finite(distance_margin),
+        "robot_steps": int(total["worlds"]) * config.n_agents,
+        "terminated_worlds": int((~alive).sum()),
+    }
+    return metrics, statistics.summary(), None if history is None else history.trajectory()
+
+
+def _finite(value: torch.Tensor) -> float | None:
+    """None (JSON null) where there is nothing to measure, such as the distance of a single robot."""
+    return float(value) if math.isfinite(value) else None
+
+
+class _History:
+    """History of the first world, every ``every``-th step."""
+
+    def __init__(self, env: SurveillanceEnv, every: int) -> None:
+        self.env, self.every = env, every
+        self.samples: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("position", "energy", "charging", "slot", "density", "coverage_cost")
+        }
+
+    def add(self, k: int, td) -> None:
+        """Take in transition k (its next state)."""
+        if k % self.every:
+            return
+        following, density = td["next"], self.env.density
+        params = following.get(keys.DENSITY, None)
+        weights = density.weights(following[keys.POSITION].new_zeros(1, 0) if params is None else params[:1])
+        rows = {
+            "position": following[keys.POSITION][0],
+            "energy": following[keys.ENERGY][0, :, 0],
+            "charging": (following[keys.ENERGY] > td[keys.ENERGY])[0, :, 0],
+            "slot": following[keys.SLOT][0, :, 0],
+            "density": weights.reshape(-1),
+            "coverage_cost": following[keys.COVERAGE_COST][0, 0],
+        }
+        for name, row in rows.items():
+            if name != "density" or density.n_params or not self.samples["density"]:
+                self.samples[name].append(row.cpu().numpy().copy())
+
+    def trajectory(self) -> Trajectory:
+        """The history for :mod:`envs.rendering`."""
+        env, config = self.env, self.env.config
+        arrays = {name: np.stack(rows) for name, rows in self.samples.items()}
+        return Trajectory(
+            **arrays,
+            points=env.density.points.cpu().numpy(),
+            stations=env.stations.cpu().numpy(),
+            slots=env.slots.cpu().numpy(),
+            arena=env.bounds.cpu().numpy(),
+            energy_min=config.energy_min,
+            energy_max=config.energy_max,
+            charge_radius=config.break_even_radius,
+            safety_distance=config.safety_distance,
+            dt=config.dt * self.every,
+        )

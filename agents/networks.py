@@ -1,0 +1,196 @@
+"""Actors, critics and exploration noise of all robots, each evaluated in one batched call."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.modules import MultiAgentMLP
+
+from agents.config import AgentConfig
+from envs import SurveillanceConfig, keys
+from safety import SafetyConfig, SafetyFilter
+
+JOINT_ACTION = ("agents", "joint_action")
+STATE_ACTION_VALUE = ("agents", "state_action_value")
+
+
+class BallActor(nn.Module):
+    """Policy networks ``pi_i(o_i)`` of all robots, squashed into the speed ball.
+
+    ``u = max_speed tanh(||z||) z / ||z||``: smooth, and unlike a tanh per axis never outside the ball.
+
+    Args:
+        n_observation: size of a robot's observation.
+        world: number of robots, dimension, speed.
+        agent: layers and sharing.
+    """
+
+    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> None:
+        super().__init__()
+        self.max_speed = world.max_speed
+        self.net = MultiAgentMLP(
+            n_observation,
+            world.dimension,
+            world.n_agents,
+            centralized=False,
+            share_params=agent.share_params,
+            num_cells=list(agent.actor_cells),
+            activation_class=nn.ReLU,
+        ).to(world.torch_dtype)
+        # Small last layers: the first policies move slowly instead of at a random full speed (DDPG, section 7).
+        last = str(2 * len(agent.actor_cells))
+        with torch.no_grad():
+            for parameter in self.net.params[last].values():
+                parameter.mul_(0.1)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``(*B, N, n_obs) -> (*B, N, d)``, m/s, norm below ``max_speed``."""
+        z = self.net(observation)
+        norm = (z.square().sum(-1, keepdim=True) + 1e-12).sqrt()
+        return self.max_speed * torch.tanh(norm) / norm * z
+
+
+class Critic(nn.Module):
+    """Action values of all robots: ``Q_i(s, a_1..a_N)``, or ``Q_i(o_i, a_i)`` for independent learners.
+
+    The state ``s`` is the concatenation of all observations; row i of the joint action is robot i's own view of it
+    (see :func:`joint_action`). Actions enter in units of ``max_speed``.
+
+    Args:
+        n_observation: size of a robot's observation.
+        world: number of robots, dimension, speed.
+        agent: algorithm, layers and sharing.
+    """
+
+    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> None:
+        super().__init__()
+        self.max_speed = world.max_speed
+        self.centralized = agent.algorithm == "maddpg"
+        seen = world.n_agents if self.centralized else 1
+        self.net = MultiAgentMLP(
+            seen * (n_observation + world.dimension),
+            1,
+            world.n_agents,
+            centralized=False,  # the input is already joint: a robot's row holds its own joint action
+            share_params=agent.share_params,
+            num_cells=list(agent.critic_cells),
+            activation_class=nn.ReLU,
+        ).to(world.torch_dtype)
+
+    def forward(self, observation: Tensor, joint: Tensor) -> Tensor:
+        """``(*B, N, n_obs), (*B, N, k) -> (*B, N, 1)``."""
+        if self.centralized:
+            n = observation.shape[-2]
+            observation = observation.flatten(-2).unsqueeze(-2).expand(*observation.shape[:-2], n, -1)
+        return self.net(torch.cat([observation, joint / self.max_speed], dim=-1))
+
+
+def joint_action(own: Tensor, others: Tensor, *, centralized: bool) -> Tensor:
+    """Joint action as each robot's critic sees it: row i holds all of ``others`` with entry i replaced by ``own_i``.
+
+    Args:
+        own: ``(*B, N, d)``, actions through which row i's gradient flows.
+        others: ``(*B, N, d)``, actions of the other robots.
+        centralized: False returns ``own`` (independent critics see nothing else).
+
+    Returns:
+        ``(*B, N, N d)``, or ``(*B, N, d)`` if not centralised.
+    """
+    if not centralized:
+        return own
+    n = own.shape[-2]
+    itself = torch.eye(n, dtype=torch.bool, device=own.device).unsqueeze(-1)
+    return torch.where(itself, own.unsqueeze(-3), others.unsqueeze(-3)).flatten(-2)
+
+
+class ExplorationNoise(TensorDictModuleBase):
+    """Adds exploration noise to the nominal action, before the filter; restarted at each episode, annealed in frames.
+
+    Gaussian: ``sigma xi``. Ornstein-Uhlenbeck: ``n+ = (1 - theta) n + sigma sqrt(1 - (1 - theta)^2) xi``, so that sigma
+    is its stationary standard deviation too.
+
+    Args:
+        agent: kind, size and annealing.
+        world: unit of the noise (max_speed).
+        seed: seed of its own generator.
+        device: where the generator lives.
+    """
+
+    def __init__(self, agent: AgentConfig, world: SurveillanceConfig, seed: int, device: torch.device | str = "cpu") -> None:
+        super().__init__()
+        self.in_keys = [keys.NOMINAL_ACTION, keys.STEP_COUNT]
+        self.out_keys = [keys.NOMINAL_ACTION]
+        self.agent = agent
+        self.max_speed = world.max_speed
+        self.generator = torch.Generator(device=device).manual_seed(seed)
+        self.frames = 0
+        self.process: Tensor | None = None
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation now, share of ``max_speed``."""
+        agent = self.agent
+        progress = min(1.0, self.frames / agent.noise_frames) if agent.noise_frames else 1.0
+        return agent.noise_initial + progress * (agent.noise_final - agent.noise_initial)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add noise to ("agents", "nominal_action") in place of it."""
+        action, step = tensordict[keys.NOMINAL_ACTION], tensordict[keys.STEP_COUNT]
+        noise = torch.randn(action.shape, generator=self.generator, dtype=action.dtype, device=action.device)
+        if self.agent.noise == "ou":
+            keep = 1 - self.agent.ou_theta
+            noise = noise * (1 - keep**2) ** 0.5
+            if self.process is not None and self.process.shape == action.shape:
+                noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, self.process)
+            self.process = noise
+        tensordict.set(keys.NOMINAL_ACTION, action + self.sigma * self.max_speed * noise)
+        self.frames += step.numel()
+        return tensordict
+
+    def get_extra_state(self) -> dict:
+        """Generator, annealing and process, for checkpoints."""
+        return {"generator": self.generator.get_state(), "frames": self.frames, "process": self.process}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Restore what :meth:`get_extra_state` returned."""
+        self.generator.set_state(state["generator"].cpu())
+        self.frames, self.process = state["frames"], state["process"]
+
+
+def make_actor(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictModule:
+    """Actor networks as a module from observation to nominal action."""
+    return TensorDictModule(BallActor(n_observation, world, agent), in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION])
+
+
+def make_critic(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictSequential:
+    """Critic networks as joint action, then value."""
+    critic = Critic(n_observation, world, agent)
+
+    def join(action: Tensor) -> Tensor:
+        return joint_action(action, action, centralized=critic.centralized)
+
+    return TensorDictSequential(
+        TensorDictModule(join, in_keys=[keys.ACTION], out_keys=[JOINT_ACTION]),
+        TensorDictModule(critic, in_keys=[keys.OBSERVATION, JOINT_ACTION], out_keys=[STATE_ACTION_VALUE]),
+    )
+
+
+def make_policies(
+    actor: TensorDictModuleBase, world: SurveillanceConfig, safety: SafetyConfig, agent: AgentConfig, seed: int, device: torch.device
+) -> tuple[TensorDictSequential, TensorDictSequential]:
+    """Deployment policy ``actor -> filter`` and exploration policy ``actor -> noise -> filter``.
+
+    Args:
+        actor: writes the nominal action.
+        world: the world.
+        safety: the filter.
+        agent: the noise.
+        seed: seed of the noise.
+        device: of the noise's generator.
+
+    Returns:
+        ``(policy, explore_policy)``; both execute filtered actions only.
+    """
+    safety_filter = SafetyFilter(safety, world)
+    noise = ExplorationNoise(agent, world, seed, device)
+    return TensorDictSequential(actor, safety_filter), TensorDictSequential(actor, noise, safety_filter)

@@ -1,0 +1,74 @@
+"""What a training run measures: violations, episodes and filter over the batches, in numbers for log and summary."""
+
+from tensordict import TensorDictBase
+
+from envs import SurveillanceConfig, keys
+from envs.metrics import EpisodeTracker
+from safety.statistics import FilterStatistics
+
+
+class TrainingRecorder:
+    """Counts every collected transition once.
+
+    Args:
+        world: the world.
+        num_envs: number of worlds.
+        device: where the per-world sums live.
+    """
+
+    def __init__(self, world: SurveillanceConfig, num_envs: int, device) -> None:
+        self.world = world
+        self.frames = 0
+        self.violations = dict.fromkeys(keys.VIOLATION_KINDS, 0)
+        self.episodes = EpisodeTracker(num_envs, device)
+        self.filter = FilterStatistics(world.max_speed)
+        self._recent = FilterStatistics(world.max_speed)
+        self._cost = [0.0, 0]
+
+    def update(self, batch: TensorDictBase) -> None:
+        """Take in a collected batch ``(num_envs, T)``."""
+        following = batch["next"]
+        flags = {kind: following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS}
+        for kind, flag in flags.items():
+            self.violations[kind] += int(flag.sum())
+        violating = sum(flag.sum(-1) for flag in flags.values())
+        self.episodes.update(following[keys.REWARD][..., 0, 0], violating, following["done"].squeeze(-1))
+        self.filter.update(batch)
+        self._recent.update(batch)
+        self._cost[0] += float(following[keys.COVERAGE_COST].sum())
+        self._cost[1] += batch.numel()
+        self.frames += batch.numel()
+
+    def scalars(self) -> dict[str, float]:
+        """Numbers since the last call, by TensorBoard tag; starts a new interval."""
+        returns = self.episodes.finished["return"][-100:]
+        counts = self.episodes.finished["violations"][-100:]
+        recent = self._recent.summary()
+        scalars = {
+            "train/episodes": self.episodes.episodes,
+            "train/coverage_cost": self._cost[0] / max(self._cost[1], 1),
+            **{f"train/violations_{kind}": count for kind, count in self.violations.items()},
+            **{f"filter/{name}": recent[name] for name in recent},
+        }
+        if returns:
+            scalars["train/return"] = sum(returns) / len(returns)
+            scalars["train/violations_per_episode"] = sum(counts) / len(counts)
+        self._recent = FilterStatistics(self.world.max_speed)
+        self._cost = [0.0, 0]
+        return scalars
+
+    def state_dict(self) -> dict:
+        """Counters and finished episodes, for checkpoints."""
+        return {
+            "frames": self.frames,
+            "violations": dict(self.violations),
+            "finished": {name: list(rows) for name, rows in self.episodes.finished.items()},
+            "filter": dict(self.filter.sums),
+            "max_residual": self.filter.max_residual,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.frames, self.violations = state["frames"], dict(state["violations"])
+        self.episodes.finished = {name: list(rows) for name, rows in state["finished"].items()}
+        self.filter.sums, self.filter.max_residual = dict(state["filter"]), state["max_residual"]

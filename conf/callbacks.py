@@ -1,0 +1,68 @@
+"""Checks before Hydra creates a folder, and errors in one message instead of a traceback."""
+
+import functools
+import os
+import sys
+import textwrap
+from collections.abc import Callable
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from conf.schema import to_config
+
+EXPECTED = (ValueError, KeyError, OSError, OmegaConfBaseException)
+
+
+def fail(error: BaseException) -> None:
+    """Print one message of at most 8 lines and leave with exit code 1."""
+    text = str(error).splitlines() or [type(error).__name__]
+    lines = [line for part in text for line in textwrap.wrap(part, 110)][:7]
+    sys.stderr.write("\n".join(["error: " + lines[0], *("  " + line for line in lines[1:])]) + "\n")
+    sys.exit(1)
+
+
+class ValidateConfig(Callback):
+    """Validates the composed configuration before anything is written.
+
+    Hydra swallows exceptions of callbacks, so a bad value ends the program here. Jobs of a multirun are validated one
+    by one when they start: a bad one must not end the others.
+    """
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Before the run folder exists."""
+        try:
+            to_config(config)
+        except EXPECTED as error:
+            if config.get("debug", False):
+                raise SystemExit(_traceback(error)) from error
+            fail(error)
+
+
+def _traceback(error: BaseException) -> str:
+    import traceback
+
+    return "".join(traceback.format_exception(error))
+
+
+def one_clear_error(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Decorate a Hydra main: an expected error ends a single run with one message, and fails one job of a multirun.
+
+    Tracebacks are shown with ``debug=true`` or ``HYDRA_FULL_ERROR=1``; programming errors always show theirs.
+    """
+
+    @functools.wraps(main)
+    def wrapper(cfg: DictConfig) -> None:
+        try:
+            main(cfg)
+        except EXPECTED as error:
+            multirun = HydraConfig.get().mode == RunMode.MULTIRUN
+            if multirun or cfg.get("debug", False) or os.environ.get("HYDRA_FULL_ERROR") == "1":
+                raise
+            fail(error)
+
+    return wrapper

@@ -1,0 +1,241 @@
+"""Typed root configuration of train.py and evaluate.py, its checks and its registration with Hydra."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from agents import AgentConfig
+from agents.controllers import CONTROLLERS
+from envs import SurveillanceConfig
+from envs.config import check_choice, check_range
+from safety import SafetyConfig
+
+# Settings that do not change what is computed by a run of a given seed.
+NOT_HASHED = ("seed", "device", "resume", "debug", "checkpoint", "hydra")
+DEVICES = ("auto", "cpu", "cuda")
+
+
+@dataclass
+class CollectorConfig:
+    """Collection of transitions. Frames are world-steps."""
+
+    num_envs: int = 128
+    """Worlds stepped in parallel, 1..1e6."""
+    steps_per_batch: int = 1
+    """Vector steps between updates, 1..1e5."""
+    total_frames: int = 1_024_000
+    """World-steps of the whole run; a multiple of num_envs * steps_per_batch."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("collector.num_envs", self.num_envs, 1, 10**6)
+        check_range("collector.steps_per_batch", self.steps_per_batch, 1, 10**5)
+        check_range("collector.total_frames", self.total_frames, 1, 10**13)
+        if self.total_frames % self.frames_per_batch:
+            nearest = max(1, round(self.total_frames / self.frames_per_batch)) * self.frames_per_batch
+            raise ValueError(
+                f"collector.total_frames={self.total_frames} is not a multiple of num_envs * steps_per_batch = "
+                f"{self.frames_per_batch}: the nearest that is, is {nearest}."
+            )
+
+    @property
+    def frames_per_batch(self) -> int:
+        """World-steps per collected batch."""
+        return self.num_envs * self.steps_per_batch
+
+
+@dataclass
+class BufferConfig:
+    """Replay buffer."""
+
+    capacity: int = 500_000
+    """Transitions kept, >= batch_size."""
+    batch_size: int = 256
+    """Transitions per minibatch, 1..1e6."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("buffer.batch_size", self.batch_size, 1, 10**6)
+        check_range("buffer.capacity", self.capacity, self.batch_size, 10**10, hint="It holds at least one minibatch.")
+
+
+@dataclass
+class TrainConfig:
+    """Updates."""
+
+    n_updates: int = 1
+    """Updates of all robots per collected batch, 0..1e6."""
+    warmup_frames: int = 2_000
+    """World-steps collected (noisy filtered policy) before the first update, >= 0."""
+    violation_penalty: float = 0.0
+    """Baseline only: subtracted from a robot's reward for each violation of its own, >= 0."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("train.n_updates", self.n_updates, 0, 10**6)
+        check_range("train.warmup_frames", self.warmup_frames, 0, 10**12)
+        check_range("train.violation_penalty", self.violation_penalty, 0, 1e9)
+
+
+@dataclass
+class EvalConfig:
+    """Deterministic evaluation."""
+
+    interval_frames: int = 128_000
+    """World-steps between evaluations during training, >= 0 (0 = only at the end)."""
+    num_envs: int = 64
+    """Worlds of an evaluation, 1..1e6."""
+    steps: int = 0
+    """Length of an evaluation; 0 = the world's horizon (1000 where it has none)."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("eval.interval_frames", self.interval_frames, 0, 10**13)
+        check_range("eval.num_envs", self.num_envs, 1, 10**6)
+        check_range("eval.steps", self.steps, 0, 10**9)
+
+
+@dataclass
+class CheckpointConfig:
+    """Checkpoints."""
+
+    interval_episodes: int = 2_000
+    """Episodes between checkpoints, >= 0 (0 = only at the end)."""
+    keep: int = 3
+    """Newest checkpoints kept, >= 0 (0 = all)."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("checkpoint.interval_episodes", self.interval_episodes, 0, 10**12)
+        check_range("checkpoint.keep", self.keep, 0, 10**6)
+
+
+@dataclass
+class Config:
+    """Everything that train.py needs."""
+
+    seed: int = 0
+    """Seed of every random stream, 0..2^31."""
+    device: str = "auto"
+    """auto | cpu | cuda."""
+    resume: str = "auto"
+    """auto: a finished run is left alone. never: start anew in the same folder."""
+    debug: bool = False
+    """Show tracebacks."""
+    env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
+    buffer: BufferConfig = field(default_factory=BufferConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+    eval: EvalConfig = field(default_factory=EvalConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+
+    def __post_init__(self) -> None:
+        """Check the combinations that no group can check alone."""
+        _check_common(self)
+        check_choice("resume", self.resume, ("auto", "never"))
+        self.safety.gains(self.env)
+        if self.agent.correction_penalty and not self.safety.in_loss:
+            raise ValueError(
+                f"agent.correction_penalty={self.agent.correction_penalty} needs the filter inside the loss: "
+                "set safety.in_loss=true, or the penalty to 0."
+            )
+
+
+@dataclass
+class EvaluateConfig:
+    """Everything that evaluate.py needs: either a run or a controller."""
+
+    run: str | None = None
+    """Folder of a training run (its world and filter are used, with env.* and safety.* overrides applied to them)."""
+    controller: str | None = None
+    """Name of a controller that is not learned."""
+    steps: int = 0
+    """Length of the rollout; 0 = the world's horizon (1000 where it has none)."""
+    num_envs: int = 64
+    """Worlds, 1..1e6."""
+    seed: int = 0
+    """Seed of the start states and of the controller, 0..2^31."""
+    device: str = "auto"
+    """auto | cpu | cuda."""
+    pictures: bool = True
+    """Write pictures and the GIF of the first world, not only eval.json."""
+    debug: bool = False
+    """Show tracebacks."""
+    env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_common(self)
+        check_range("steps", self.steps, 0, 10**9)
+        check_range("num_envs", self.num_envs, 1, 10**6)
+        if (self.run is None) == (self.controller is None):
+            raise ValueError(f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>.")
+        if self.controller is not None:
+            check_choice("controller", self.controller, tuple(CONTROLLERS))
+        if self.run is not None and not (Path(self.run) / ".hydra" / "config.yaml").is_file():
+            raise ValueError(f"run={self.run} is not the folder of a run: {self.run}/.hydra/config.yaml does not exist.")
+        self.safety.gains(self.env)
+
+
+def _check_common(config: Any) -> None:
+    check_range("seed", config.seed, 0, 2**31)
+    check_choice("device", config.device, DEVICES)
+
+
+def register() -> None:
+    """Tell Hydra the schemas and the resolvers that name the run folders."""
+    store = ConfigStore.instance()
+    store.store(name="train_schema", node=Config)
+    store.store(name="evaluate_schema", node=EvaluateConfig)
+    OmegaConf.register_new_resolver("config_hash", lambda *, _root_: config_hash(_root_), replace=True)
+    OmegaConf.register_new_resolver("evaluation_folder", lambda *, _root_: evaluation_folder(_root_), replace=True)
+
+
+def to_config(cfg: DictConfig) -> Any:
+    """The validated dataclass of a composed configuration.
+
+    Raises:
+        ValueError: naming the value, what is allowed and the remedy.
+    """
+    own = cfg.copy()
+    with open_dict(own):
+        own.pop("hydra", None)
+    return OmegaConf.to_object(own)
+
+
+def config_hash(cfg: DictConfig) -> str:
+    """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
+    names = [str(name) for name in cfg if name not in NOT_HASHED]
+    content = {name: _plain(cfg, name) for name in sorted(names)}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _plain(cfg: DictConfig, name: str) -> Any:
+    value = cfg[name]
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def evaluation_folder(cfg: DictConfig) -> str:
+    """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers."""
+    choices = cfg.hydra.runtime.choices
+    if cfg.run is None:
+        return f"runs/controllers/{cfg.controller}_{choices.safety}_{choices.env}_{cfg.steps}_{cfg.seed}_{config_hash(cfg)}"
+    given = OmegaConf.load(Path(cfg.run) / ".hydra" / "hydra.yaml")
+    overridden = any(str(entry).startswith("env=") for entry in cfg.hydra.overrides.task)
+    world = choices.env if overridden else given.hydra.runtime.choices.env
+    return f"{cfg.run}/eval/{world}_{cfg.steps}_{cfg.seed}"
+
+
+def write_json(path: Path, content: dict) -> None:
+    """Write ``content`` indented, complete or not at all; a NaN or infinity raises ``ValueError``."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    temporary.replace(path)

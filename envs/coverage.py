@@ -1,0 +1,83 @@
+"""Voronoi coverage: the locational cost J and its gradient by quadrature on a regular grid.
+
+``J(x) = int min_i ||p_i - q||^2 phi(q) dq`` with the density normalised to 1. Every cell of the grid is represented by
+its centre plus, by the parallel axis theorem, its own second moment, which makes the midpoint rule exact for a
+quadratic integrand.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def quadrature_points(bounds: list[list[float]], resolution: int, **factory) -> tuple[Tensor, float]:
+    """Centres of a regular grid over a box, and the second moment of one cell.
+
+    Args:
+        bounds: ``[low, high]`` per axis, m.
+        resolution: cells per axis.
+        **factory: ``dtype`` and ``device`` of the result.
+
+    Returns:
+        Points ``(Q, d)``, m, row-major over the axes, and ``sum_axes (side^2 / 12)``, m^2.
+    """
+    axes = [low + (high - low) * (torch.arange(resolution, **factory) + 0.5) / resolution for low, high in bounds]
+    points = torch.stack([g.flatten() for g in torch.meshgrid(*axes, indexing="ij")], dim=-1)
+    return points, math.fsum(((high - low) / resolution) ** 2 / 12 for low, high in bounds)
+
+
+def squared_distances(position: Tensor, points: Tensor) -> Tensor:
+    """Squared distances of robots and points, ``(*B, N, d), (Q, d) -> (*B, N, Q)``, m^2.
+
+    Written as ``|p|^2 - 2 p.q + |q|^2`` (one matrix product), with at most rounding below zero removed.
+    """
+    cross = position @ points.T
+    norms = position.square().sum(-1, keepdim=True) + points.square().sum(-1)
+    return (norms - 2 * cross).clamp_min(0)
+
+
+def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment: float) -> Tensor:
+    """Locational cost ``J = sum_q w_q min_i ||p_i - q||^2 + cell_moment``.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        points: ``(Q, d)``, m.
+        weights: ``(Q,)`` or ``(*B, Q)``, summing to 1.
+        cell_moment: second moment of one cell, m^2, from :func:`quadrature_points`.
+
+    Returns:
+        ``(*B,)``, m^2.
+
+    Source: Cortes et al., Coverage control for mobile sensing networks (2004): the locational optimisation function.
+    """
+    return (squared_distances(position, points).amin(dim=-2) * weights).sum(-1) + cell_moment
+
+
+def voronoi_moments(position: Tensor, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Mass and centroid of every robot's Voronoi cell.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        points: ``(Q, d)``, m.
+        weights: ``(Q,)`` or ``(*B, Q)``, summing to 1.
+
+    Returns:
+        Mass ``(*B, N)`` and centroid ``(*B, N, d)``, m; the centroid of a cell without mass is the robot itself.
+    """
+    nearest = squared_distances(position, points).argmin(dim=-2, keepdim=True)
+    robots = torch.arange(position.shape[-2], device=position.device).unsqueeze(-1)
+    owned = (nearest == robots).to(position.dtype) * weights.unsqueeze(-2)
+    mass = owned.sum(-1)
+    moment = owned @ points
+    safe = mass.clamp_min(torch.finfo(position.dtype).tiny).unsqueeze(-1)
+    return mass, torch.where(mass.unsqueeze(-1) > 0, moment / safe, position)
+
+
+def coverage_gradient(position: Tensor, points: Tensor, weights: Tensor) -> Tensor:
+    """Gradient of J: ``dJ/dp_i = 2 m_i (p_i - c_i)``, ``(*B, N, d)``, m.
+
+    Args and source as :func:`coverage_cost`; ``m_i, c_i`` are mass and centroid of robot i's cell.
+    """
+    mass, centroid = voronoi_moments(position, points, weights)
+    return 2 * mass.unsqueeze(-1) * (position - centroid)

@@ -1,0 +1,39 @@
+"""Motion of the robots: single integrator, exact under a zero-order hold, with a Euclidean speed limit."""
+
+import torch
+from torch import Tensor
+
+
+def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
+    """Scale velocities outside the speed ball onto it; others are returned bit for bit.
+
+    Args:
+        velocity: ``(*B, N, d)``, m/s.
+        max_speed: radius of the ball, m/s.
+
+    Returns:
+        ``(*B, N, d)``, m/s, norm at most ``max_speed`` up to rounding.
+    """
+    speed = velocity.norm(dim=-1, keepdim=True)
+    # The tolerance keeps the map idempotent in float32: an action cut once is not cut again.
+    return torch.where(speed > max_speed * (1 + 1e-6), velocity * (max_speed / speed.clamp_min(1e-30)), velocity)
+
+
+def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
+    """Single integrator ``p+ = p + dt u``.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        velocity: ``(*B, N, d)``, m/s, constant over the step.
+        dt: length of the step, s.
+
+    Returns:
+        ``(*B, N, d)``, m.
+    """
+    return position + dt * velocity
+
+
+def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
+    i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
+    return i, j

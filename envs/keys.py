@@ -1,0 +1,28 @@
+"""TensorDict keys shared by the environment, the filter, the learner and the controllers (one place, no strings elsewhere)."""
+
+AGENTS = "agents"
+OBSERVATION = (AGENTS, "observation")
+POSITION = (AGENTS, "position")
+ENERGY = (AGENTS, "energy")
+SLOT = (AGENTS, "slot")
+NOMINAL_ACTION = (AGENTS, "nominal_action")
+ACTION = (AGENTS, "action")
+CHARGE_CURRENT = (AGENTS, "charge_current")
+REWARD = (AGENTS, "reward")
+DONE = (AGENTS, "done")
+TERMINATED = (AGENTS, "terminated")
+VIOLATION = (AGENTS, "violation")
+VIOLATION_KINDS = ("depleted", "stranded", "overcharged", "collision")
+
+COVERAGE_COST = "coverage_cost"
+DENSITY = "density"
+STEP_COUNT = "step_count"
+
+FILTER = "filter"
+CORRECTION = (FILTER, "correction")
+STATUS = (FILTER, "status")
+LEVEL = (FILTER, "level")
+RESIDUAL = (FILTER, "residual")
+BARRIER_ENERGY = (FILTER, "h_c")
+BARRIER_OVERCHARGE = (FILTER, "h_o")
+BARRIER_COLLISION = (FILTER, "h_s")

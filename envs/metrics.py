@@ -1,0 +1,110 @@
+"""What is measured: violations on the raw state, charges, episodes. Nothing here knows of the filter.
+
+All comparisons are written so that NaN counts as a violation.
+"""
+
+import torch
+from torch import Tensor
+
+from envs.config import SurveillanceConfig
+from envs.keys import VIOLATION_KINDS
+
+
+def violations(
+    position: Tensor, next_position: Tensor, next_energy: Tensor, slots: Tensor, config: SurveillanceConfig
+) -> dict[str, Tensor]:
+    """Violation flags of one transition, with tolerance zero, from the raw next state.
+
+    depleted: ``E < E_min``. overcharged: ``E > E_max``. collision: two robots came closer than ``safety_distance``
+    anywhere on the step's straight segments (both count). stranded: less energy left than the fastest way to the
+    nearest slot's break-even circle costs.
+
+    Args:
+        position: ``(*B, N, d)``, m, before the step.
+        next_position: ``(*B, N, d)``, m.
+        next_energy: ``(*B, N)``.
+        slots: ``(S, d)``, m.
+        config: the world.
+
+    Returns:
+        ``{kind: (*B, N) bool}`` for the kinds of :data:`envs.keys.VIOLATION_KINDS`.
+    """
+    way = (next_position.unsqueeze(-2) - slots).norm(dim=-1).amin(dim=-1)
+    needed = config.drain_rate * (way - config.break_even_radius).clamp_min(0) / config.max_speed
+    gap = _step_gap(position, next_position)
+    n_agents = position.shape[-2]
+    itself = torch.eye(n_agents, dtype=torch.bool, device=position.device)
+    flags = (
+        ~(next_energy >= config.energy_min),
+        ~(next_energy - config.energy_min >= needed),
+        ~(next_energy <= config.energy_max),
+        (~(gap >= config.safety_distance) & ~itself).any(dim=-1),
+    )
+    return dict(zip(VIOLATION_KINDS, flags, strict=True))
+
+
+def _step_gap(position: Tensor, next_position: Tensor) -> Tensor:
+    """Least distance of every two robots over the step, ``(*B, N, N)``: closest point of the relative segment to 0."""
+    start = position.unsqueeze(-2) - position.unsqueeze(-3)
+    move = next_position.unsqueeze(-2) - next_position.unsqueeze(-3) - start
+    length = move.square().sum(-1)
+    t = torch.where(length > 0, -(start * move).sum(-1) / length.clamp_min(1e-30), torch.zeros_like(length)).clamp(0, 1)
+    return (start + t.unsqueeze(-1) * move).norm(dim=-1)
+
+
+def minimum_distance(position: Tensor, next_position: Tensor) -> Tensor:
+    """Least distance of any two robots over the step, ``(*B,)``, m; inf for one robot."""
+    gap = _step_gap(position, next_position)
+    itself = torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
+    return torch.where(itself, torch.inf, gap).flatten(-2).amin(dim=-1)
+
+
+class ChargeCounter:
+    """Counts charges: intervals of rising energy that gain at least 20 % of the battery's range."""
+
+    def __init__(self, energy: Tensor, config: SurveillanceConfig) -> None:
+        self.threshold = 0.2 * (config.energy_max - config.energy_min)
+        self.start = energy.clone()
+        self.counted = torch.zeros_like(energy, dtype=torch.bool)
+        self.count = torch.zeros_like(energy, dtype=torch.int64)
+
+    def update(self, energy: Tensor, next_energy: Tensor, alive: Tensor) -> None:
+        """Take in one transition, ``(*B, N)`` each; ``alive`` ``(*B, 1)`` masks worlds that have ended."""
+        rising = next_energy > energy
+        # a pause ends the interval
+        self.counted = self.counted & rising
+        self.start = torch.where(rising, self.start, next_energy)
+        reached = rising & ~self.counted & (next_energy - self.start >= self.threshold) & alive
+        self.count += reached
+        self.counted = self.counted | reached
+
+
+class EpisodeTracker:
+    """Sums reward and violations per world until its episode ends, and keeps the finished episodes in order."""
+
+    def __init__(self, num_envs: int, device: torch.device | None = None) -> None:
+        self.reward = torch.zeros(num_envs, dtype=torch.float64, device=device)
+        self.violations = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self.finished: dict[str, list[float]] = {"return": [], "violations": []}
+
+    def update(self, reward: Tensor, violations: Tensor, done: Tensor) -> None:
+        """Take in transitions in order of time.
+
+        Args:
+            reward: ``(B, T)``, team reward.
+            violations: ``(B, T)``, violating robot-steps.
+            done: ``(B, T)`` bool.
+        """
+        for r, v, d in zip(reward.unbind(1), violations.unbind(1), done.unbind(1), strict=True):
+            self.reward += r
+            self.violations += v
+            if d.any():
+                self.finished["return"] += self.reward[d].tolist()
+                self.finished["violations"] += self.violations[d].tolist()
+                self.reward[d] = 0
+                self.violations[d] = 0
+
+    @property
+    def episodes(self) -> int:
+        """Number of finished episodes."""
+        return len(self.finished["return"])

@@ -1,0 +1,359 @@
+"""The surveillance world as a batched TorchRL environment.
+
+A thin shell: physics, batteries, coverage, densities and homing geometry are pure tensor functions of their own
+modules; this file packs specs and keys, steps all worlds at once and resets by mask.
+"""
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from envs import keys
+from envs.battery import charge, charging_field, power
+from envs.config import SurveillanceConfig
+from envs.coverage import squared_distances, voronoi_moments
+from envs.density import Density
+from envs.dynamics import integrate, limit_speed
+from envs.homing import exchange_slots, is_certified, reassign_slots, reserve
+from envs.metrics import violations
+
+RESET_DRAWS = 16  # candidate start states per world and reset; docked where none is certified
+
+
+class SurveillanceEnv(EnvBase):
+    """``num_envs`` independent worlds of ``config``, stepped in parallel.
+
+    Writes the keys of :mod:`envs.keys`. The observation of robot i, in this order (lengths in units of half the
+    arena's longest side ``L``, relative vectors as *other minus own*):
+
+    ========================  ==================  ==============================================================
+    field                     size                meaning
+    ========================  ==================  ==============================================================
+    position                  d                   own position relative to the arena's middle, / L
+    energy                    1                   (E - E_min) / (E_max - E_min)
+    slot                      d                   vector to the own charging slot, / L
+    stations                  M d                 vectors to all stations, / L
+    others' positions         (N - 1) d           vectors to robots i+1, i+2, .. (cyclic), / L
+    others' energies          N - 1               as energy, same order
+    density                   n_observed          parameters of a density that varies (centres / L, or coarse ages)
+    time                      1 if horizon > 0    share of the episode that has passed, at most 1
+    centroid                  d, only on request  vector to the centroid of the own Voronoi cell, / L
+    ========================  ==================  ==============================================================
+
+    Args:
+        config: the world; a dataclass that has already validated itself.
+        num_envs: number of worlds B, >= 1.
+        device: where the state lives.
+        seed: seed of the environment's own random generator.
+
+    Raises:
+        ValueError: if ``num_envs < 1``.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        config: SurveillanceConfig | None = None,
+        num_envs: int = 1,
+        device: torch.device | str | None = None,
+        seed: int | None = 0,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
+        config = config or SurveillanceConfig()
+        device = torch.device(device or "cpu")
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.config = config
+        self.geometry = config.homing
+        factory = {"dtype": config.torch_dtype, "device": device}
+        self.density = Density(config, device)
+        self.stations = torch.tensor(config.station_positions, **factory)
+        self.slots = torch.tensor(config.slot_positions, **factory)
+        self.bounds = torch.tensor(config.bounds, **factory)
+        others = torch.arange(config.n_agents).unsqueeze(-1) + torch.arange(1, config.n_agents)
+        self._others = (others % config.n_agents).to(device)  # (N, N-1): robots i+1, i+2, ..
+        docked = self.slots[: config.n_agents]
+        self.reference_cost = float(self._nearest_squared(docked).mean()) + self.density.cell_moment
+        self.generator = torch.Generator(device=device)
+        self._make_specs()
+        self._set_seed(seed)
+        self._state = self._blank_state()
+        self._write_start(torch.ones(num_envs, dtype=torch.bool, device=device))
+
+    # ---- TorchRL interface -----------------------------------------------------------------------------------------
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        self._write_start(mask.reshape(self.batch_size))
+        out = self._outputs()
+        for kind in keys.VIOLATION_KINDS:
+            out[(*keys.VIOLATION, kind)] = torch.zeros((*self._robots, 1), dtype=torch.bool, device=self.device)
+        return self._with_flags(out, torch.zeros_like(mask).reshape(-1, 1), torch.zeros_like(mask).reshape(-1, 1))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        config, state = self.config, self._state
+        position, energy = state["position"], state["energy"]
+        velocity = limit_speed(tensordict[keys.ACTION].to(position.dtype), config.max_speed)
+        if config.on_violation == "continue":
+            velocity = torch.where((energy < config.energy_min).unsqueeze(-1), 0.0, velocity)
+        current = tensordict.get(keys.CHARGE_CURRENT, None)
+        current = torch.ones_like(energy) if current is None else current.squeeze(-1).to(energy.dtype)
+        next_position, next_energy = self.transition(position, energy, velocity, current)
+
+        flags = violations(position, next_position, next_energy, self.slots, config)
+        violated = torch.stack(list(flags.values())).any(dim=0).any(dim=-1, keepdim=True)
+        nearest = self._nearest_squared(next_position)
+        slot = state["slot"]
+        if config.reassign_slots:
+            slot = reassign_slots(next_position, next_energy, slot, self.slots, self.geometry, self.bounds)
+        self._state = TensorDict(
+            {
+                "position": next_position,
+                "energy": next_energy,
+                "slot": slot,
+                "step": state["step"] + 1,
+                "density": self.density.advance(state["density"], nearest),
+            },
+            self.batch_size,
+            device=self.device,
+        )
+        out = self._outputs(nearest)
+        for kind, flag in flags.items():
+            out[(*keys.VIOLATION, kind)] = flag.unsqueeze(-1)
+        reward = -out[keys.COVERAGE_COST] / self.reference_cost
+        out[keys.REWARD] = reward.unsqueeze(-1).expand(*self._robots, 1).clone()
+        terminated = violated if config.on_violation == "terminate" else torch.zeros_like(violated)
+        step = self._state["step"]
+        truncated = step >= config.horizon if config.horizon else torch.zeros_like(violated)
+        return self._with_flags(out, terminated, truncated)
+
+    def state_dict(self, *args, **kwargs) -> dict:
+        """State of all worlds and of the random generator: restoring it continues the same random stream."""
+        return {"state": self._state.clone().to_dict(), "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state_dict: dict, *args, **kwargs) -> None:
+        """Restore what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the state belongs to another world or another number of worlds.
+        """
+        given = TensorDict(state_dict["state"], self.batch_size if "state" in state_dict else [])
+        for name, value in self._state.items():
+            if name not in given or given[name].shape != value.shape:
+                raise ValueError(
+                    f"state {name!r} has shape {tuple(given[name].shape) if name in given else None}, this environment needs "
+                    f"{tuple(value.shape)}: the checkpoint is of another world or another collector.num_envs."
+                )
+        self._state = given.to(self.device)
+        self.generator.set_state(state_dict["generator"].cpu())
+
+    def set_state(self, position: Tensor, energy: Tensor, slot: Tensor | None = None) -> TensorDictBase:
+        """Place all robots by hand (tests, replays) and return the outputs of that state, as ``reset`` would.
+
+        Args:
+            position: ``(B, N, d)``, m.
+            energy: ``(B, N, 1)``.
+            slot: ``(B, N, 1)`` int64; unchanged if not given.
+
+        Returns:
+            The environment's output keys at the new state.
+        """
+        self._state["position"] = position.to(self.bounds).expand(*self._robots, -1).clone()
+        self._state["energy"] = energy.to(self.bounds).squeeze(-1).expand(self._robots).clone()
+        if slot is not None:
+            self._state["slot"] = slot.to(self.device).squeeze(-1).expand(self._robots).clone()
+        return self.reset(TensorDict({"_reset": torch.zeros(*self.batch_size, 1, dtype=torch.bool)}, self.batch_size))
+
+    # ---- physics ---------------------------------------------------------------------------------------------------
+    def transition(self, position: Tensor, energy: Tensor, velocity: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
+        """Raw next position and energy: never saturated by walls or battery.
+
+        Args:
+            position: ``(B, N, d)``, m.
+            energy: ``(B, N)``.
+            velocity: ``(B, N, d)``, m/s.
+            current: ``(B, N)``, accepted charging current in [0, 1].
+
+        Returns:
+            ``(B, N, d)`` and ``(B, N)``.
+        """
+        c = self.config
+        field = charging_field(position, self.stations, full_radius=c.charge_radius_full, zero_radius=c.charge_radius)
+        drain = power(
+            velocity.norm(dim=-1),
+            drain_rate=c.drain_rate,
+            per_speed=c.drain_per_speed,
+            per_speed_squared=c.drain_per_speed_squared,
+        )
+        next_energy = charge(energy, field, current, drain, charge_rate=c.charge_rate, dt=c.dt)
+        return integrate(position, velocity, c.dt), next_energy
+
+    # ---- start states ----------------------------------------------------------------------------------------------
+    def _write_start(self, mask: Tensor) -> None:
+        """Draw certified start states for the worlds in ``mask`` ``(B,)``; the others keep theirs."""
+        index = mask.nonzero().squeeze(-1)
+        if index.numel() == 0:
+            return
+        drawn = self._draw_start(index.numel())
+        for name, value in drawn.items():
+            self._state[name] = self._state[name].index_copy(0, index, value)
+
+    def _draw_start(self, batch: int) -> dict[str, Tensor]:
+        """Certified states of ``batch`` worlds: the first certified of several draws, docked where there is none."""
+        c, g, n = self.config, self.geometry, self.config.n_agents
+        low, high = self.bounds.unbind(-1)
+        span = c.energy_max - c.energy_min
+        position = low + (high - low) * self._rand(batch, RESET_DRAWS, n, c.dimension)
+        share = self._rand(batch, RESET_DRAWS, n)
+        slot = torch.arange(n, device=self.device).expand(batch, RESET_DRAWS, n)
+        full = torch.full_like(share, c.energy_max)
+        for _ in range(n):  # rounds of the exchange, not robots: every round improves all worlds at once
+            slot = exchange_slots(position, full, slot, self.slots, g)
+        least = c.energy_min + 2 * g.eps_energy + c.reset_reserve * span
+        need = least + reserve((position - self.slots[slot]).norm(dim=-1), g)
+        top = c.energy_max - g.eps_energy
+        energy = need + (top - need).clamp_min(0) * share
+        clearance = c.reset_clearance
+        certified = is_certified(position, energy, self.slots[slot], g, self.bounds, clearance=clearance)
+        certified &= (need <= top).all(dim=-1)
+        first = certified.to(torch.uint8).argmax(dim=1)
+        rows = torch.arange(batch, device=self.device)
+        position, energy, slot = position[rows, first], energy[rows, first], slot[rows, first]
+        found = certified.any(dim=1, keepdim=True)
+        docked = torch.arange(n, device=self.device).expand(batch, n)
+        slot = torch.where(found, slot, docked)
+        return {
+            "position": torch.where(found.unsqueeze(-1), position, self.slots[docked]),
+            "energy": torch.where(found, energy, least + (top - least) * share[:, 0]),
+            "slot": slot,
+            "step": torch.zeros(batch, 1, dtype=torch.int64, device=self.device),
+            "density": self.density.sample(batch, self.generator),
+        }
+
+    def _rand(self, *shape: int) -> Tensor:
+        return torch.rand(shape, generator=self.generator, dtype=self.config.torch_dtype, device=self.device)
+
+    def _blank_state(self) -> TensorDict:
+        zeros = {"dtype": self.config.torch_dtype, "device": self.device}
+        b, n = self._robots
+        return TensorDict(
+            {
+                "position": torch.zeros(b, n, self.config.dimension, **zeros),
+                "energy": torch.zeros(b, n, **zeros),
+                "slot": torch.zeros(b, n, dtype=torch.int64, device=self.device),
+                "step": torch.zeros(b, 1, dtype=torch.int64, device=self.device),
+                "density": torch.zeros(b, self.density.n_params, **zeros),
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+    # ---- outputs ---------------------------------------------------------------------------------------------------
+    @property
+    def _robots(self) -> tuple[int, int]:
+        return self.batch_size[0], self.config.n_agents
+
+    def _nearest_squared(self, position: Tensor) -> Tensor:
+        """Squared distance of every quadrature point to the nearest robot, ``(*B, Q)``, m^2."""
+        return squared_distances(position, self.density.points).amin(dim=-2)
+
+    def _outputs(self, nearest: Tensor | None = None) -> TensorDict:
+        """All keys that describe the present state; ``nearest`` saves recomputing the Voronoi distances."""
+        state = self._state
+        nearest = self._nearest_squared(state["position"]) if nearest is None else nearest
+        weights = self.density.weights(state["density"])
+        cost = (nearest * weights).sum(-1, keepdim=True) + self.density.cell_moment
+        out = {
+            keys.OBSERVATION: self._observe(weights),
+            keys.POSITION: state["position"].clone(),
+            keys.ENERGY: state["energy"].unsqueeze(-1).clone(),
+            keys.SLOT: state["slot"].unsqueeze(-1).clone(),
+            keys.COVERAGE_COST: cost,
+            keys.STEP_COUNT: state["step"].clone(),
+        }
+        if self.density.n_params:
+            out[keys.DENSITY] = state["density"].clone()
+        return TensorDict(out, self.batch_size, device=self.device)
+
+    def _observe(self, weights: Tensor) -> Tensor:
+        c, state = self.config, self._state
+        position, length = state["position"], c.length_scale
+        share = (state["energy"] - c.energy_min) / (c.energy_max - c.energy_min)
+        relative = position[:, self._others] - position.unsqueeze(-2)  # (B, N, N-1, d)
+        fields = [
+            (position - self.bounds.mean(-1)) / length,
+            share.unsqueeze(-1),
+            (self.slots[state["slot"]] - position) / length,
+            (self.stations - position.unsqueeze(-2)).flatten(-2) / length,
+            relative.flatten(-2) / length,
+            share[:, self._others],
+        ]
+        if self.density.n_observed:
+            fields.append(self.density.observe(state["density"]).unsqueeze(-2).expand(*self._robots, -1))
+        if c.horizon:
+            time = (state["step"].to(share.dtype) / c.horizon).clamp_max(1)
+            fields.append(time.unsqueeze(-2).expand(*self._robots, 1))
+        if c.observe_centroid:
+            _, centroid = voronoi_moments(position, self.density.points, weights)
+            fields.append((centroid - position) / length)
+        return torch.cat(fields, dim=-1)
+
+    def _with_flags(self, out: TensorDict, terminated: Tensor, truncated: Tensor) -> TensorDict:
+        flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        for name, flag in flags.items():
+            out[name] = flag
+            out[(keys.AGENTS, name)] = flag.unsqueeze(-1).expand(*self._robots, 1).clone()
+        return out
+
+    def _make_specs(self) -> None:
+        c, (b, n) = self.config, self._robots
+        factory = {"dtype": c.torch_dtype, "device": self.device}
+
+        def unbounded(*shape: int) -> Unbounded:
+            return Unbounded(shape=(*self.batch_size, *shape), **factory)
+
+        def flag(*shape: int) -> Binary:
+            return Binary(n=1, shape=(*self.batch_size, *shape), dtype=torch.bool, device=self.device)
+
+        n_observed = c.dimension * (2 + len(self.stations) + n - 1) + n + self.density.n_observed
+        n_observed += (c.horizon > 0) + c.dimension * c.observe_centroid
+        self.n_observation = n_observed
+
+        def agents(**entries) -> Composite:
+            return Composite(entries, shape=(b,), device=self.device)
+
+        self.observation_spec = Composite(
+            {
+                keys.AGENTS: agents(
+                    observation=unbounded(n, n_observed),
+                    position=unbounded(n, c.dimension),
+                    energy=unbounded(n, 1),
+                    slot=Categorical(n=len(self.slots), shape=(b, n, 1), dtype=torch.int64, device=self.device),
+                    violation=agents(**{kind: flag(n, 1) for kind in keys.VIOLATION_KINDS}),
+                ),
+                keys.COVERAGE_COST: unbounded(1),
+                keys.STEP_COUNT: Unbounded(shape=(b, 1), dtype=torch.int64, device=self.device),
+            },
+            shape=self.batch_size,
+            device=self.device,
+        )
+        if self.density.n_params:
+            self.observation_spec[keys.DENSITY] = unbounded(self.density.n_params)
+        # A box around the speed ball: the environment's actuators cut what lies outside the ball.
+        self.action_spec = Composite(
+            {keys.AGENTS: agents(action=Bounded(-c.max_speed, c.max_speed, shape=(b, n, c.dimension), **factory))},
+            shape=self.batch_size,
+            device=self.device,
+        )
+        self.reward_spec = Composite({keys.AGENTS: agents(reward=unbounded(n, 1))}, shape=self.batch_size, device=self.device)
+        done = {name: flag(1) for name in ("done", "terminated", "truncated")}
+        done[keys.AGENTS] = agents(**{name: flag(n, 1) for name in ("done", "terminated", "truncated")})
+        self.done_spec = Composite(done, shape=self.batch_size, device=self.device)

@@ -1,0 +1,289 @@
+"""The safety filter: nominal action in, executed action out.
+
+Per robot (split=half|full) or per world (split=joint):
+
+    min ||u - u^||^2   s.t.   L_F h + L_G h (u, c) >= -alpha h  for the barriers' rows,   ||u|| <= max_speed,
+
+with the accepted current ``c`` in closed form (nominal current 1; more current never hurts survivability). No row is
+ever relaxed: a problem without solution, or one the solver could not solve to its tolerance, falls to **hold**
+(``u = 0``), is flagged in ("filter", "status") and counted in ("filter", "level") = 1. The nominal action is never
+executed unfiltered. What this filter does not promise: its rows are the literature's, so holding, another robot or the
+length of a step can still lead to a violation; the environment counts those.
+"""
+
+import dataclasses
+import math
+from functools import lru_cache
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from envs import keys
+from envs.battery import charging_field
+from envs.config import SurveillanceConfig
+from envs.dynamics import limit_speed, pair_indices
+from safety.barriers import (
+    BarrierRow,
+    accepted_current,
+    collision_barrier,
+    energy_barrier,
+    overcharge_barrier,
+    sampled_energy_row,
+)
+from safety.config import SafetyConfig
+from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
+
+POLYGON_FACES = 16  # 2-D speed limit of solvers without a ball: an inscribed regular polygon
+POLYHEDRON_FACES = 64  # 3-D: inscribed polyhedron with spiral face normals
+
+
+class SafetyFilter(TensorDictModuleBase):
+    """Reads nominal action, position, energy and slot; writes executed action, accepted current and diagnostics.
+
+    A pure function of what it reads: no state, no randomness. Keys and shapes:
+
+    * in: nominal_action ``(*B, N, d)`` m/s, position ``(*B, N, d)`` m, energy ``(*B, N, 1)``, slot ``(*B, N, 1)`` int64.
+    * out: action ``(*B, N, d)`` m/s in the speed ball, charge_current ``(*B, N, 1)`` in [0, 1], correction
+      ``(*B, N, 1)`` = ||u - u^|| with u^ first cut to the speed ball, status and level ``(*B, N)`` int64, residual
+      and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``.
+
+    A non-finite nominal action is replaced by hold, flagged INACCURATE and counted.
+
+    Args:
+        safety: which filter.
+        world: the world it stands in.
+
+    Raises:
+        ValueError: if a gain does not fit the world's time step.
+        KeyError: from ``forward``, if an input key is missing.
+    """
+
+    def __init__(self, safety: SafetyConfig, world: SurveillanceConfig) -> None:
+        super().__init__()
+        self.safety = safety
+        self.world = world
+        self.gains = safety.gains(world)
+        # The literature's reserve: full speed, no sampled-data margin.
+        self.literal = dataclasses.replace(world.homing, speed=world.max_speed, gain=world.max_speed / world.diameter)
+        self.geometry = world.homing
+        self.in_keys = [keys.NOMINAL_ACTION, keys.POSITION, keys.ENERGY, keys.SLOT]
+        self.out_keys = [
+            *(keys.ACTION, keys.CHARGE_CURRENT, keys.CORRECTION, keys.STATUS, keys.LEVEL, keys.RESIDUAL),
+            *(keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION),
+        ]
+        self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Filter the nominal action of ``tensordict`` and write the results into it."""
+        inputs = [tensordict.get(key, None) for key in self.in_keys]
+        missing = [key for key, value in zip(self.in_keys, inputs, strict=True) if value is None]
+        if missing:
+            raise KeyError(f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}.")
+        nominal, position, energy, slot = inputs
+        outputs = self.filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
+        for key, value in zip(self.out_keys, outputs, strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def filter(self, nominal: Tensor, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[Tensor, ...]:
+        """The filter on plain tensors, in the order of ``out_keys``.
+
+        Args:
+            nominal: ``(*B, N, d)``, m/s.
+            position: ``(*B, N, d)``, m.
+            energy: ``(*B, N)``.
+            slot: ``(*B, N)`` int64.
+
+        Returns:
+            The tensors of ``out_keys``.
+        """
+        h_c, h_o, h_s = self._barriers(position, energy, slot)
+        cut = limit_speed(nominal, self.world.max_speed)
+        finite = nominal.isfinite().all(dim=-1)
+        if self.safety.mode == "none":
+            action, current = cut, torch.ones_like(energy)
+            status = level = torch.zeros_like(slot)
+            residual = torch.zeros_like(energy)
+        else:
+            target = torch.where(finite.unsqueeze(-1), cut, 0.0)
+            action, current, status, residual = self._program(target, position, energy, slot, h_c, h_o, h_s)
+            status = torch.where(finite, status, int(QPStatus.INACCURATE))
+            hold = status != QPStatus.SOLVED
+            action = torch.where(hold.unsqueeze(-1), 0.0, action)
+            level = hold.to(torch.int64)
+        # the gradient of the norm at 0 is 0, not NaN
+        difference = (action - cut).nan_to_num()
+        squared = difference.square().sum(-1, keepdim=True)
+        correction = torch.where(squared > 0, squared.clamp_min(torch.finfo(squared.dtype).tiny).sqrt(), 0.0)
+        return (
+            *(action, current.unsqueeze(-1), correction, status, level, residual.unsqueeze(-1)),
+            *(h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value.amin(dim=-1, keepdim=True)),
+        )
+
+    def _program(
+        self, target: Tensor, position: Tensor, energy: Tensor, slot: Tensor, h_c: BarrierRow, h_o: BarrierRow, h_s: BarrierRow
+    ) -> tuple[Tensor, ...]:
+        """Rows, current and solution: ``(action, current, status, residual)``."""
+        alpha_c, alpha_o, alpha_s = self.gains
+        if self.safety.sampled_data:
+            # one rounding margin: a robot that stays docked approaches E_max to the last bit
+            h_o = h_o._replace(value=h_o.value - self.geometry.eps_energy)
+        current, chargeable = accepted_current(h_o, alpha_o)
+        active_c = active_o = torch.ones_like(chargeable)
+        active_s = torch.isfinite(h_s.value)
+        if self.safety.composition == "min":
+            # h_i = min(h_c, h_o, pairs); ties go to the lowest index, which argmin returns
+            smallest = torch.cat([h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value], dim=-1).argmin(dim=-1)
+            chosen = torch.nn.functional.one_hot(smallest, 2 + h_s.value.shape[-1]).bool()
+            active_c, active_o, active_s = chosen[..., 0], chosen[..., 1], chosen[..., 2:]
+            current = torch.where(active_o & chargeable, current, 1.0)
+        impossible = active_o & ~chargeable
+        if self.safety.sampled_data:
+            # the robot may drain at full power whatever it does, so its next energy is bounded by that
+            next_energy = energy + self.world.dt * (h_c.drift + h_c.current_gain * current)
+            _, slots = self._layout(position)
+            dt, step = self.world.dt, self.world.max_speed * self.world.dt
+            arguments = (position, energy, next_energy, slots[slot], self.geometry)
+            _, gain_c, bound_c = sampled_energy_row(*arguments, gain=alpha_c * dt, step=step)
+        else:
+            gain_c, bound_c = -h_c.velocity_gain, h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
+        bound_c = torch.where(active_c, bound_c, torch.inf)
+        bound_s = torch.where(active_s, alpha_s * h_s.value, torch.inf)
+        gain_s = -h_s.velocity_gain
+        if self.safety.split == "joint":
+            action, status, residual = self._solve_joint(target, gain_c, bound_c, gain_s, bound_s)
+        else:
+            share = 0.5 if self.safety.split == "half" else 1.0
+            G = torch.cat([gain_c.unsqueeze(-2), _without_self(gain_s)], dim=-2)
+            h = torch.cat([bound_c.unsqueeze(-1), share * _without_self(bound_s.unsqueeze(-1)).squeeze(-1)], dim=-1)
+            action, status, residual = self._solve_per_robot(target, G, h)
+        status = torch.where(impossible, int(QPStatus.INFEASIBLE), status)
+        return action, current, status, residual
+
+    def _solve_per_robot(self, target: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One problem per robot: ``G (*B, N, m, d)``, ``h (*B, N, m)``."""
+        radius = self.world.max_speed
+        if self.safety.solver == "qpth":
+            faces, offset = _speed_faces(target.shape[-1], radius)
+            faces = torch.tensor(faces, dtype=target.dtype, device=target.device)
+            G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)
+            h = torch.cat([h, h.new_full((*h.shape[:-1], len(faces)), offset)], dim=-1)
+            identity = torch.eye(target.shape[-1], dtype=target.dtype, device=target.device)
+            solution = solve_qp(identity, -target, G, h, solver="qpth")
+        else:
+            solution = project_halfspaces_ball(target, G, h, radius)
+        return solution.value, solution.status, solution.residual
+
+    def _solve_joint(
+        self, target: Tensor, gain_c: Tensor, bound_c: Tensor, gain_s: Tensor, bound_s: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """One problem per world over all N d velocities; its status and residual are every robot's."""
+        n, d = target.shape[-2:]
+        G, h = self._joint_rows(gain_c, bound_c, gain_s, bound_s)
+        identity = torch.eye(n * d, dtype=target.dtype, device=target.device)
+        if target.requires_grad:
+            # robot i's gradient flows through its own nominal action only: N copies, the neighbours' detached
+            own = torch.eye(n, dtype=torch.bool, device=target.device).unsqueeze(-1)
+            nominal = torch.where(own, target.unsqueeze(-3), target.detach().unsqueeze(-3)).flatten(-2)
+            solution = solve_qp(identity, -nominal, G.unsqueeze(-3), h.unsqueeze(-2), solver="qpth")
+            diagonal = torch.arange(n, device=target.device)
+            action = solution.value.unflatten(-1, (n, d))[..., diagonal, diagonal, :]
+            return action, solution.status, solution.residual
+        solution = solve_qp(identity, -target.flatten(-2), G, h, solver="qpth")
+        shape = target.shape[:-1]
+        action = solution.value.unflatten(-1, (n, d))
+        return action, solution.status.unsqueeze(-1).expand(shape), solution.residual.unsqueeze(-1).expand(shape)
+
+    def _joint_rows(self, gain_c: Tensor, bound_c: Tensor, gain_s: Tensor, bound_s: Tensor) -> tuple[Tensor, Tensor]:
+        """Rows of the joint problem: N survivability, P collision, then the faces of every robot's speed polytope."""
+        n, d = gain_c.shape[-2:]
+        batch = gain_c.shape[:-2]
+        i, j = pair_indices(n, gain_c.device)
+        pairs = torch.arange(len(i), device=gain_c.device)
+        pair_rows = gain_c.new_zeros(*batch, len(i), n, d)
+        pair_rows[..., pairs, i, :] = gain_s[..., i, j, :]
+        pair_rows[..., pairs, j, :] = gain_s[..., j, i, :]
+        eye = torch.eye(n, dtype=gain_c.dtype, device=gain_c.device)
+        own_rows = eye.unsqueeze(-1) * gain_c.unsqueeze(-2)
+        faces, offset = _speed_faces(d, self.world.max_speed)
+        faces = torch.tensor(faces, dtype=gain_c.dtype, device=gain_c.device)
+        face_rows = torch.einsum("ij,fd->ifjd", eye, faces).flatten(0, 1).expand(*batch, -1, n, d)
+        # a pair's row is asked for if either robot's composite is that pair
+        bound_pair = torch.minimum(bound_s[..., i, j], bound_s[..., j, i])
+        G = torch.cat([own_rows, pair_rows, face_rows], dim=-3).flatten(-2)
+        return G, torch.cat([bound_c, bound_pair, gain_c.new_full((*batch, face_rows.shape[-3]), offset)], dim=-1)
+
+    def solve_task(self, Q: Tensor, p: Tensor, position: Tensor, energy: Tensor, slot: Tensor) -> Tensor:
+        """Joint quadratic program of a task controller under this filter's rows; hold where it cannot be solved.
+
+        Args:
+            Q: ``(*B, N d, N d)``, symmetric positive definite.
+            p: ``(*B, N d)``.
+            position: ``(*B, N, d)``, m.
+            energy: ``(*B, N)``.
+            slot: ``(*B, N)`` int64.
+
+        Returns:
+            ``(*B, N, d)``, m/s.
+        """
+        h_c, h_o, h_s = self._barriers(position, energy, slot)
+        alpha_c, alpha_o, alpha_s = self.gains
+        current, _ = accepted_current(h_o, alpha_o)
+        bound_c = h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
+        G, h = self._joint_rows(-h_c.velocity_gain, bound_c, -h_s.velocity_gain, alpha_s * h_s.value)
+        solution = solve_qp(Q, p, G, h, solver="qpth")
+        solved = (solution.status == QPStatus.SOLVED).unsqueeze(-1)
+        return torch.where(solved, solution.value, 0.0).unflatten(-1, position.shape[-2:])
+
+    def _barriers(self, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
+        """Rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
+        world = self.world
+        stations, slots = self._layout(position)
+        field = charging_field(position, stations, full_radius=world.charge_radius_full, zero_radius=world.charge_radius)
+        rates = {"charge_rate": world.charge_rate}
+        return (
+            energy_barrier(position, energy, slots[slot], field, self.literal, **rates),
+            overcharge_barrier(energy, field, energy_max=world.energy_max, drain_rate=world.drain_rate, **rates),
+            collision_barrier(position, safety_distance=world.safety_distance),
+        )
+
+    def _layout(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Stations and slots on the device and in the type of ``like``. Not buffers: the loss must not copy them."""
+        key = (like.device, like.dtype)
+        if key not in self._layouts:
+            factory = {"dtype": like.dtype, "device": like.device}
+            world = self.world
+            self._layouts[key] = (
+                torch.tensor(world.station_positions, **factory),
+                torch.tensor(world.slot_positions, **factory),
+            )
+        return self._layouts[key]
+
+
+def _without_self(rows: Tensor) -> Tensor:
+    """Drop the diagonal of ``(*B, N, N, k)`` rows: ``(*B, N, N - 1, k)``."""
+    n = rows.shape[-2]
+    others = (torch.arange(n, device=rows.device).unsqueeze(-1) + torch.arange(1, n, device=rows.device)) % n
+    return rows.gather(-2, others.unsqueeze(-1).expand(*rows.shape[:-3], n, n - 1, rows.shape[-1]))
+
+
+@lru_cache
+def _speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float]:
+    """Face normals and offset of a polytope inscribed in the speed ball."""
+    if dimension == 2:
+        angles = [2 * math.pi * k / POLYGON_FACES for k in range(POLYGON_FACES)]
+        return [[math.cos(a), math.sin(a)] for a in angles], radius * math.cos(math.pi / POLYGON_FACES)
+    normals, probes = _spiral(POLYHEDRON_FACES), _spiral(40_000)
+    # a vertex lies where the nearest normal is farthest; the probes miss it by less than 0.02 rad
+    widest = (probes @ normals.T).amax(dim=-1).clamp(-1, 1).acos().amax().item() + 0.02
+    return normals.tolist(), radius * math.cos(widest)
+
+
+def _spiral(n: int) -> Tensor:
+    """``n`` nearly even directions in 3-D (golden spiral), ``(n, 3)``."""
+    k = torch.arange(n, dtype=torch.float64)
+    z = 1 - (2 * k + 1) / n
+    angle = k * math.pi * (3 - math.sqrt(5))
+    return torch.stack([(1 - z * z).sqrt() * angle.cos(), (1 - z * z).sqrt() * angle.sin(), z], dim=-1)

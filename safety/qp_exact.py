@@ -1,0 +1,495 @@
+"""Exact active-set solution of small quadratic programmes, and the linear algebra both QP solvers share.
+
+Problem (one per sample, flat batch B, always float64 here; see safety/qp.py for the public border):
+
+    min_u  ½ uᵀQu + pᵀu    s.t.  G u ≤ h  and, optionally,  ‖u‖ ≤ radius,        u ∈ Rⁿ, n ≤ 3.
+
+With Q = I and target t = -p it is a projection. For a set S of linearly independent rows, write {G_S u = h_S} = f +
+null(G_S), f the foot point of the origin, and Pt the projection of t on null(G_S). The best point of that plane inside
+the ball is u_S = f + Pt/c with c = max(1, ‖Pt‖ / sqrt(radius² - ‖f‖²)); it is stationary with row multipliers λ_S from
+G_Sᵀλ_S = t - c u_S and ball multiplier c - 1 ≥ 0. The problem is convex, so u_S is *the* solution if and only if it
+satisfies the other rows and λ_S ≥ 0, and by Carathéodory some S with |S| ≤ n does. So sizes |S| = 0..n are enumerated
+in turn and a sample stops at the first size that has such a set. Nothing here loops over samples or rows.
+
+Conventions: rows are normalised to unit norm (`normalise_rows`); a row that can never bind is g = 0, h = 1.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class QPStatus(IntEnum):
+    """What is known about a returned value; only SOLVED values may be executed."""
+
+    SOLVED = 0
+    INACCURATE = 1
+    INFEASIBLE = 2
+
+
+EARLY_STOP = 1e-12
+"""KKT violation (relative) at which no larger active set is tried: a few thousand roundings of float64."""
+RANK_TOL = 1e-12
+"""Sine of the angle below which a row counts as linearly dependent on the rows chosen before it."""
+GRAZE = 1e-8
+"""Least half-chord, relative to the radius, of a plane through the ball. A plane that only touches the ball has no
+multipliers; opening the chord by 1e-8 radii changes ‖u‖ by 5e-17 relative and makes them exist."""
+SCALE_FLOOR = 1e-3
+"""Lengths are compared with max(‖u‖, 1e-3 ‖unconstrained solution‖): a solution at the origin still has a scale."""
+CHUNK_BYTES = 256 * 2**20
+"""Bound on the temporaries of one enumeration step, bytes."""
+ROOT_ITERATIONS = 80
+"""Most steps of the search for the ball multiplier; 4 to 8 are usual."""
+
+_TINY = 1e-300
+
+
+class Raw(NamedTuple):
+    """Solution of a flat batch in float64.
+
+    Attributes:
+        u: (B, n) solution.
+        lam: (B, m) multipliers of the rows as they were given.
+        mu: (B,) ball multiplier μ, stationarity being Qu + p + Gᵀλ + μu = 0.
+        status: (B,) int64.
+        residual: (B,) relative KKT residual.
+        iterations: (B,) int64.
+    """
+
+    u: Tensor
+    lam: Tensor
+    mu: Tensor
+    status: Tensor
+    residual: Tensor
+    iterations: Tensor
+
+    @classmethod
+    def blank(cls, u: Tensor, m: int) -> Raw:
+        """SOLVED at `u` (B, n) with all m multipliers zero."""
+        zero = torch.zeros_like(u[:, 0])
+        count = torch.zeros_like(zero, dtype=torch.int64)
+        return cls(u.clone(), u.new_zeros(u.shape[0], m), zero, count, zero.clone(), count.clone())
+
+    def put(self, index: Tensor, part: Raw) -> None:
+        """Write `part` into the samples `index`, in place."""
+        for mine, theirs in zip(self, part, strict=True):
+            mine[index] = theirs
+
+
+def norm(x: Tensor) -> Tensor:
+    """Euclidean norm over the last dimension."""
+    return torch.linalg.vector_norm(x, dim=-1)
+
+
+def _length(x: Tensor) -> Tensor:
+    """Euclidean norm over the first dimension (torch's own reduces a short leading dimension ten times slower)."""
+    return (x * x).sum(0).sqrt()
+
+
+def normalise_rows(G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Scale rows to unit norm and replace those that can never bind by g = 0, h = 1.
+
+    Args:
+        G: (B, m, n) finite rows.
+        h: (B, m) bounds; +inf means no constraint.
+
+    Returns:
+        G (B, m', n), h (B, m'), row norms (B, m') and whether a zero row demands 0 ≤ h < 0 (B,). m' = max(m, 1).
+    """
+    if G.shape[1] == 0:
+        G, h = G.new_zeros(G.shape[0], 1, G.shape[2]), h.new_ones(h.shape[0], 1)
+    big = G.abs().amax(-1)
+    zero = big == 0
+    big = torch.where(zero, 1.0, big)  # two steps, or the squares of tiny rows would underflow
+    unit = G / big[..., None]
+    length = torch.where(zero, 1.0, norm(unit))
+    bound = (h / big / length).clamp(max=1e150)
+    idle = zero | torch.isposinf(h)
+    impossible = (zero & (h < 0)).any(-1)
+    unit = torch.where(idle[..., None], 0.0, unit / length[..., None])
+    return unit, torch.where(idle, 1.0, bound), big * length, impossible
+
+
+def kkt_residual(
+    Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, u: Tensor, lam: Tensor, mu: Tensor, radius: float | None
+) -> Tensor:
+    """Relative KKT residual: the largest of stationarity, row and ball violation, dual sign, complementarity.
+
+    Forces (stationarity, λ, μ·radius) are measured against max(‖p‖, ‖Qu‖), lengths (violations and slacks) against
+    max(‖u‖, 1e-3 min(‖Q⁻¹p‖, radius)). Complementarity of a row is min(λ, slack) in these units, which unlike the
+    product does not shrink quadratically. Rows must have unit norm, so the number does not depend on row scaling.
+
+    Args:
+        Q: (B, n, n) SPD, or None for the identity.
+        p: (B, n).
+        G: (B, m, n) unit rows.
+        h: (B, m).
+        u: (B, n).
+        lam: (B, m).
+        mu: (B,).
+        radius: length unit of u, or None.
+
+    Returns:
+        (B,) residual; +inf where anything is not finite.
+    """
+    Qu = u if Q is None else (Q @ u[..., None])[..., 0]
+    free = norm(p) if Q is None else norm(torch.linalg.solve_ex(Q, p[..., None])[0][..., 0])
+    free = free if radius is None else free.clamp(max=radius)
+    force = torch.maximum(norm(p), norm(Qu)).clamp(min=_TINY)
+    length = torch.maximum(norm(u), SCALE_FLOOR * free).clamp(min=_TINY)
+    gradient = Qu + p + (G * lam[..., None]).sum(1) + mu[:, None] * u
+    slack = (h - (G * u[:, None]).sum(-1)) / length[:, None]
+    dual = lam / force[:, None]
+    worst = torch.maximum(norm(gradient) / force, torch.minimum(dual, slack).abs().amax(-1))
+    if radius is not None:
+        gap = (radius - norm(u)) / radius
+        worst = torch.maximum(worst, torch.minimum(mu * radius / force, gap).abs())
+    return torch.where(torch.isfinite(worst), worst, torch.inf)
+
+
+class Basis(NamedTuple):
+    """Orthonormal basis of the span of chosen rows: rows[picks]ᵀ = axesᵀ·R, see `pivoted_basis`."""
+
+    axes: Tensor  # (B, k, n), zero where no independent row was left
+    picks: Tensor  # (B, k) row numbers
+    R: Tensor  # (B, k, k) upper triangular, unit diagonal where an axis is zero
+
+    def project(self, x: Tensor) -> Tensor:
+        """Component of x (B, n) orthogonal to the chosen rows."""
+        for _ in range(2):
+            x = x - ((self.axes @ x[..., None]) * self.axes).sum(1)
+        return x
+
+
+def pivoted_basis(rows: Tensor, active: Tensor, weight: Tensor | None = None) -> Basis:
+    """Pick up to n linearly independent rows among the active ones by pivoted Gram-Schmidt.
+
+    Redundant rows are simply never picked, so nothing downstream is singular.
+
+    Args:
+        rows: (B, m, n) unit rows.
+        active: (B, m) bool.
+        weight: (B, m) preference among the rows, positive; default all alike.
+    """
+    left = rows * active[..., None]
+    axes, picks = [], []
+    for _ in range(min(rows.shape[1:])):
+        size = norm(left)
+        pick = torch.where(size > 1e-10, size if weight is None else size * weight, 0.0).argmax(-1)
+        chosen = left[torch.arange(len(left), device=left.device), pick]
+        length = norm(chosen)[:, None]
+        axis = torch.where(length > 1e-10, chosen / length.clamp(min=_TINY), 0.0)
+        for _ in range(2):  # twice is enough (Kahan)
+            left = left - (left @ axis[..., None]) * axis[:, None]
+        axes.append(axis)
+        picks.append(pick)
+    A, order = torch.stack(axes, 1), torch.stack(picks, 1)
+    R = (A @ rows.gather(1, order[..., None].expand_as(A)).mT).triu()
+    dead = ~A.any(-1)
+    R = torch.where(dead[:, :, None] | dead[:, None, :], 0.0, R) + torch.diag_embed(dead.to(R.dtype))
+    return Basis(A, order, R)
+
+
+def _candidates(
+    t: Tensor, G: Tensor, h: Tensor, sets: Tensor, radius: float | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Best point of each plane {G_S u = h_S} in the ball, by Gram-Schmidt on the rows of S (no normal equations).
+
+    Args:
+        t: (B, n) targets.
+        G: (B, m, n) unit rows.
+        h: (B, m).
+        sets: (C, k) row numbers of the active sets.
+        radius: ball radius or None.
+
+    Returns:
+        u (B, C, n), λ_S (B, C, k), c (B, C), relative primal violation (B, C), relative dual violation (B, C).
+    """
+    (C, k), n = sets.shape, t.shape[-1]
+    planes = G.permute(2, 0, 1)  # components first: sums over them are then additions of long contiguous runs
+    foot, flat = t.new_zeros(n, len(t), C), t.mT[:, :, None].expand(-1, -1, C)
+    ok = torch.ones_like(foot[0], dtype=torch.bool)
+    axes: list[Tensor] = []
+    R: list[list[Tensor]] = []  # R[j][i] = component of row j on axis i
+    y: list[Tensor] = []
+    z: list[Tensor] = []
+    for j in range(k):
+        v, coef = planes[:, :, sets[:, j]], [torch.zeros_like(foot[0])] * j
+        for _ in range(2):  # second pass restores orthogonality between nearly parallel rows
+            for i in range(j):
+                part = (v * axes[i]).sum(0)
+                v, coef[i] = v - part * axes[i], coef[i] + part
+        size = _length(v)
+        ok = ok & (size > RANK_TOL)
+        size = torch.where(size > RANK_TOL, size, 1.0)
+        rest = h[:, sets[:, j]]
+        for i in range(j):
+            rest = rest - coef[i] * y[i]
+        axes.append(v / size)
+        R.append([*coef, size])
+        y.append(rest / size)
+        z.append((axes[j] * flat).sum(0))
+        foot, flat = foot + axes[j] * y[j], flat - axes[j] * z[j]
+    if k == n:
+        flat = torch.zeros_like(foot)
+    else:
+        for axis in axes:
+            flat = flat - axis * (axis * flat).sum(0)
+    c = torch.ones_like(foot[0])
+    if radius is not None and k < n:
+        away = _length(foot)
+        half = ((radius - away) * (radius + away)).clamp(min=(GRAZE * radius) ** 2).sqrt()
+        c = (_length(flat) / half).clamp(min=1.0)
+    u = foot + flat / c
+    lam: list[Tensor] = [c] * k
+    for j in reversed(range(k)):
+        rest = z[j] - c * y[j]
+        for i in range(j + 1, k):
+            rest = rest - R[i][j] * lam[i]
+        lam[j] = rest / R[j][j]
+
+    size, target = _length(u), norm(t)[:, None]
+    length = torch.maximum(size, SCALE_FLOOR * (target if radius is None else target.clamp(max=radius)))
+    primal = torch.baddbmm(-h[..., None], G, u.transpose(0, 1)).amax(1) / length.clamp(min=_TINY)
+    if radius is not None:
+        primal = torch.maximum(primal, size / radius - 1)
+    dual = torch.zeros_like(size)
+    for x in lam:
+        dual = torch.maximum(dual, -x)
+    dual = dual / torch.maximum(target, size).clamp(min=_TINY)
+    ok = ok & torch.isfinite(primal) & torch.isfinite(dual)
+    primal, dual = torch.where(ok, primal.clamp(min=0.0), torch.inf), torch.where(ok, dual, torch.inf)
+    return u.permute(1, 2, 0), torch.stack(lam, -1) if k else c[..., None][..., :0], c, primal, dual
+
+
+class Projection(NamedTuple):
+    """Best candidate of every sample.
+
+    Attributes:
+        u: (B, n) candidate with the least max(primal, dual) violation.
+        lam: (B, m) its row multipliers.
+        c: (B,) its scale, one plus the ball multiplier.
+        nearest: (B, n) candidate with the least primal violation.
+        violation: (B,) that least primal violation, relative.
+        sizes: (B,) int64 number of active-set sizes tried.
+    """
+
+    u: Tensor
+    lam: Tensor
+    c: Tensor
+    nearest: Tensor
+    violation: Tensor
+    sizes: Tensor
+
+
+def enumerate_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projection:
+    """Project t on {G u ≤ h} ∩ ball by enumeration of active sets (module docstring).
+
+    Args:
+        t: (B, n) targets.
+        G: (B, m, n) unit rows.
+        h: (B, m).
+        radius: ball radius or None.
+    """
+    (B, m, n) = G.shape
+    inf = t.new_full((B,), torch.inf)
+    best = Projection(t.clone(), t.new_zeros(B, m), t.new_ones(B), t.clone(), inf, torch.zeros_like(inf).long())
+    score = inf.clone()
+    rows, todo = torch.arange(m, device=t.device), torch.arange(B, device=t.device)
+    for k in range(min(n, m) + 1):
+        sets = torch.combinations(rows, k) if k else rows.new_zeros(1, 0)
+        step = max(1, CHUNK_BYTES // (8 * len(sets) * (3 * m + n * (3 * k + 6))))
+        for some in todo.split(step):
+            u, lam, c, primal, dual = _candidates(t[some], G[some], h[some], sets, radius)
+            low, j = torch.maximum(primal, dual).min(1)
+            take = low < score[some]
+            who, j = some[take], j[take]
+            score[who] = low[take]
+            best.u[who], best.c[who] = u[take, j], c[take, j]
+            best.lam[who] = t.new_zeros(len(who), m).scatter(1, sets[j], lam[take, j])
+            low, j = primal.min(1)
+            closer = low < best.violation[some]
+            best.violation[some[closer]] = low[closer]
+            best.nearest[some[closer]] = u[closer, j[closer]]
+        best.sizes[todo] = k + 1
+        todo = todo[score[todo] > EARLY_STOP]
+        if not len(todo):
+            break
+    return best
+
+
+def settle(raw: Raw, violation: Tensor, nearest: Tensor, radius: float | None, tol: float) -> Raw:
+    """Fill in the status from the residual and make everything that is not SOLVED finite and inside the ball."""
+    solved = raw.residual <= tol
+    status = torch.where(violation > tol, QPStatus.INFEASIBLE.value, QPStatus.INACCURATE.value)
+    status = torch.where(solved, QPStatus.SOLVED.value, status)
+    u = torch.where(solved[:, None], raw.u, torch.nan_to_num(nearest, 0.0, 0.0, 0.0))
+    if radius is not None:
+        size = norm(u)
+        u = torch.where((solved | (size <= radius))[:, None], u, u * (radius / size.clamp(min=radius))[:, None])
+    lam = torch.where(solved[:, None], raw.lam, 0.0)
+    return raw._replace(u=u, status=status, lam=lam.clamp(min=0.0), mu=torch.where(solved, raw.mu, 0.0))
+
+
+def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+    """Exact projection; targets that are feasible are returned as they are.
+
+    Args:
+        t: (B, n) finite targets.
+        G: (B, m, n) finite rows, any scale.
+        h: (B, m) bounds, +inf allowed.
+        radius: ball radius or None.
+        tol: KKT tolerance.
+    """
+    raw, m = Raw.blank(t, G.shape[1]), G.shape[1]
+    outside = ((G * t[:, None]).sum(-1) > h).any(-1)
+    if radius is not None:
+        outside = outside | (norm(t) > radius)
+    index = outside.nonzero()[:, 0]
+    if len(index):
+        t, (G, h, size, impossible) = t[index], normalise_rows(G[index], h[index])
+        found = enumerate_projection(t, G, h, radius)
+        mu = found.c - 1
+        residual = kkt_residual(None, -t, G, h, found.u, found.lam, mu, radius)
+        residual = torch.where(impossible, torch.inf, residual)
+        part = Raw(found.u, (found.lam / size)[:, :m], mu, found.sizes, residual, found.sizes)
+        violation = torch.where(impossible, torch.inf, found.violation)
+        raw.put(index, settle(part, violation, found.nearest, radius, tol))
+    return raw
+
+
+class Metric:
+    """Change of variables w = Lᵀu with Q = LLᵀ, in which the objective is ½‖w‖² - (-L⁻¹p)ᵀw.
+
+    Attributes:
+        L: (B, n, n) Cholesky factor, identity where Q is not positive definite.
+        bad: (B,) whether Q is not positive definite.
+        rows: (B, m, n) unit rows of G L⁻ᵀ.
+        scale: (B, m) their norms before scaling.
+    """
+
+    def __init__(self, Q: Tensor, G: Tensor) -> None:
+        L, info = torch.linalg.cholesky_ex(Q)
+        self.bad = (info != 0) | ~torch.isfinite(L).all(-1).all(-1)
+        self.L = torch.where(self.bad[:, None, None], torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device), L)
+        rows = torch.linalg.solve_triangular(self.L, G.mT, upper=False).mT
+        size = norm(rows)
+        self.scale = torch.where(size > 0, size, 1.0)
+        self.rows = rows / self.scale[..., None]
+
+    def down(self, x: Tensor) -> Tensor:
+        """L⁻¹x for x (B, n)."""
+        return torch.linalg.solve_triangular(self.L, x[..., None], upper=False)[..., 0]
+
+    def up(self, w: Tensor, index: Tensor | None = None) -> Tensor:
+        """Back to u = L⁻ᵀw for w (B, n), or (b, n) for the samples `index` (b,)."""
+        L = self.L if index is None else self.L[index]
+        return torch.linalg.solve_triangular(L.mT, w[..., None], upper=True)[..., 0]
+
+
+def _solve_rows(Q: Tensor, p: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Metric]:
+    """Rows only, SPD Q, unit rows: u, λ, least violation, sizes tried, metric."""
+    metric = Metric(Q, G)
+    idle = ~G.any(-1)
+    found = enumerate_projection(-metric.down(p), metric.rows, torch.where(idle, 1.0, h / metric.scale), None)
+    violation = torch.where(metric.bad, 0.0, found.violation)
+    return metric.up(found.u), found.lam / metric.scale, violation, found.sizes, metric
+
+
+def _find_ball_multiplier(
+    Q: Tensor, p: Tensor, G: Tensor, h: Tensor, radius: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Find μ ≥ 0 with ‖u(μ)‖ = radius, u(μ) the rows-only solution for Q + μI; the norm falls as μ grows.
+
+    Newton on 1/‖u(μ)‖ (nearly linear in μ while the active set stays), safeguarded by a bracket in τ = μ/(μ + s) ∈
+    [0, 1). Where the step leaves the bracket, the one from its left end is taken, from which Newton converges
+    monotonically; every fourth step bisects, because the norm has kinks where the active set changes.
+
+    Returns:
+        u (B, n), λ (B, m), μ (B,), steps (B,).
+    """
+    eye = torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device)
+    s = Q.diagonal(dim1=-2, dim2=-1).mean(-1)
+    lo, hi, mu, left = torch.zeros_like(s), torch.ones_like(s), torch.zeros_like(s), torch.zeros_like(s)
+    u, lam = torch.zeros_like(p), torch.zeros_like(h)
+    best, steps, best_mu = torch.full_like(s, torch.inf), torch.zeros_like(s, dtype=torch.int64), torch.zeros_like(s)
+    todo = torch.arange(len(p), device=p.device)
+    for step in range(ROOT_ITERATIONS):
+        H = Q[todo] + mu[todo, None, None] * eye
+        v, dual, _, _, metric = _solve_rows(H, p[todo], G[todo], h[todo])
+        size = norm(v)
+        gap = (size / radius - 1).abs()
+        better = gap < best[todo]
+        who = todo[better]
+        best[who], u[who], lam[who], best_mu[who] = gap[better], v[better], dual[better], mu[who]
+        steps[todo] = step + 1
+        tau = mu[todo] / (mu[todo] + s[todo])
+        lo[todo] = torch.where(size > radius, tau, lo[todo])
+        hi[todo] = torch.where(size > radius, hi[todo], tau)
+        slope = norm(pivoted_basis(metric.rows, dual > 0).project(metric.down(v))).square()  # uᵀ(du/dμ) = -slope
+        newton = mu[todo] + (size / radius - 1) * size.square() / slope.clamp(min=_TINY)
+        newton = newton / (newton + s[todo])
+        left[todo] = torch.where(size > radius, newton, left[todo])
+        a, b, start = lo[todo], hi[todo], left[todo]
+        tau = (a + b) / 2
+        if step % 4 != 3:
+            tau = torch.where((start > a) & (start < b), start, tau)
+            tau = torch.where((newton > a) & (newton < b), newton, tau)
+        mu[todo] = s[todo] * tau / (1 - tau).clamp(min=1e-16)
+        todo = todo[(best[todo] > 1e-13) & (b - a > 1e-16)]
+        if not len(todo):
+            break
+    return u, lam, best_mu, steps
+
+
+def solve_general(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+    """Exact solution for SPD Q (B, n, n); other arguments as `solve_projection` with p (B, n)."""
+    m, (G, h, size, impossible) = G.shape[1], normalise_rows(G, h)
+    u, lam, violation, steps, metric = _solve_rows(Q, p, G, h)
+    mu, nearest = torch.zeros_like(steps, dtype=u.dtype), u
+    if radius is not None:
+        index = ((norm(u) > radius) | (violation > tol)).nonzero()[:, 0]
+        if len(index):
+            # The least-norm point tells whether rows and ball meet at all; relative to the radius, unlike `violation`.
+            centre = enumerate_projection(torch.zeros_like(u[index]), G[index], h[index], radius)
+            violation[index], nearest = centre.violation, nearest.index_copy(0, index, centre.nearest)
+            index = index[(centre.violation <= tol) & ~metric.bad[index]]
+            v, dual, ball, extra = _find_ball_multiplier(Q[index], p[index], G[index], h[index], radius)
+            u, lam = u.index_copy(0, index, v), lam.index_copy(0, index, dual)
+            mu, steps = mu.index_copy(0, index, ball), steps.index_copy(0, index, extra)
+    residual = kkt_residual(Q, p, G, h, u, lam, mu, radius)
+    residual = torch.where(impossible | metric.bad, torch.inf, residual)
+    raw = Raw(u, (lam / size)[:, :m], mu, steps, residual, steps)
+    return settle(raw, torch.where(impossible, torch.inf, violation), nearest, radius, tol)
+
+
+def solve_exact(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+    """Exact solution, by projection where Q is a multiple of the identity.
+
+    Args:
+        Q: (B, n, n) symmetric, or None for the identity.
+        p: (B, n).
+        G: (B, m, n).
+        h: (B, m), +inf allowed; everything else finite.
+        radius: ball radius, length unit of u, or None.
+        tol: KKT tolerance, relative.
+    """
+    if Q is None:
+        return solve_projection(-p, G, h, radius, tol)
+    c = Q[:, :1, :1]
+    ball = c * torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device)
+    round_ = ((ball == Q) & (c > 0)).all(-1).all(-1)
+    raw = Raw.blank(p, G.shape[1])
+    index = round_.nonzero()[:, 0]
+    if len(index):
+        c = c[index, 0]
+        part = solve_projection(-p[index] / c, G[index], h[index], radius, tol)
+        raw.put(index, part._replace(lam=part.lam * c, mu=part.mu * c[:, 0]))
+    index = (~round_).nonzero()[:, 0]
+    if len(index):
+        raw.put(index, solve_general(Q[index], p[index], G[index], h[index], radius, tol))
+    return raw

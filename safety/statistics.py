@@ -1,0 +1,64 @@
+"""What the filter did, summed over a run: the block ``filter`` of summary.json and of eval.json."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from envs import keys
+from safety.qp import QPStatus
+
+
+class FilterStatistics:
+    """Running sums over filtered robot-steps.
+
+    Args:
+        max_speed: unit of the intervention threshold, m/s.
+    """
+
+    def __init__(self, max_speed: float) -> None:
+        self.max_speed = max_speed
+        self.sums = {
+            name: 0.0
+            for name in ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside")
+        }
+        self.max_residual = 0.0
+
+    def update(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> None:
+        """Take in filter outputs of any batch shape.
+
+        Args:
+            tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``.
+            alive: ``(*B, 1)`` bool, worlds that count; all if not given.
+        """
+        status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
+        correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
+        barriers = [tensordict[key].squeeze(-1) for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)]
+        counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
+        outside = ~torch.stack([h >= 0 for h in barriers]).all(dim=0)
+        rows = (
+            counts,
+            counts & (correction > 1e-6 * self.max_speed),
+            torch.where(counts, correction, 0.0),
+            counts & (level > 0),
+            counts & (status == QPStatus.INFEASIBLE),
+            counts & (status == QPStatus.INACCURATE),
+            counts & outside,
+        )
+        totals = torch.stack([row.sum(dtype=torch.float64) for row in rows])
+        largest = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max()
+        for name, total in zip(self.sums, totals.tolist(), strict=True):
+            self.sums[name] += total
+        self.max_residual = max(self.max_residual, float(largest))
+
+    def summary(self) -> dict[str, float]:
+        """Rates per robot-step, counts in robot-steps, mean correction in m/s, largest residual of an executed solution."""
+        steps = max(self.sums["robot_steps"], 1.0)
+        return {
+            "intervention_rate": self.sums["interventions"] / steps,
+            "mean_correction": self.sums["correction"] / steps,
+            "fallback_rate": self.sums["fallbacks"] / steps,
+            "infeasible": int(self.sums["infeasible"]),
+            "inaccurate": int(self.sums["inaccurate"]),
+            "outside": int(self.sums["outside"]),
+            "max_residual": self.max_residual,
+        }
