@@ -10,48 +10,24 @@ import logging
 from pathlib import Path
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents import make_controller
-from agents.checkpoint import check_world, latest_checkpoint, load_checkpoint
+from agents.checkpoint import latest_checkpoint, load_checkpoint
 from agents.evaluation import evaluate_policy
 from agents.networks import make_actor
 from agents.pipeline import pick_device
 from conf.callbacks import one_clear_error
-from conf.schema import Config, EvaluateConfig, register, to_config, write_json
+from conf.schema import EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
 from safety import SafetyConfig, SafetyFilter
 
 register()
 logging.getLogger("torchrl").setLevel(logging.WARNING)
-
-
-def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
-    """Configuration of the run ``cfg.run`` with the command line's env and safety overrides applied to it."""
-    given = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.load(Path(cfg.run) / ".hydra" / "config.yaml"))
-    for override in overrides:
-        key = override.split("=")[0].lstrip("+~")
-        if key.split(".")[0] in ("env", "safety"):
-            OmegaConf.update(given, key, OmegaConf.select(cfg, key), merge=False)
-    return to_config(given)
-
-
-def load_actor(
-    run: Path, config: Config, world: SurveillanceConfig, n_observation: int, device: torch.device
-) -> TensorDictModuleBase:
-    """Trained actor of a run's newest checkpoint, if it was made for this world."""
-    path = latest_checkpoint(run)
-    content = load_checkpoint(path, device)
-    sizes = {"n_agents": world.n_agents, "dimension": world.dimension, "n_observation": n_observation}
-    check_world(path, content["world"], sizes)
-    actor = make_actor(n_observation, world, config.agent).to(device)
-    actor.load_state_dict(content["actor"])
-    return actor
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
@@ -67,12 +43,13 @@ def main(cfg: DictConfig) -> None:
         trained = run_config(cfg, list(HydraConfig.get().overrides.task))
         world, safety = trained.env, trained.safety
         env = SurveillanceEnv(world, config.num_envs, device, seed=config.seed)
-        nominal = load_actor(Path(config.run), trained, world, env.n_observation, device)
+        nominal = make_actor(env.n_observation, world, trained.agent).to(device)
+        nominal.load_state_dict(load_checkpoint(latest_checkpoint(Path(config.run)), device)["actor"])
     else:
         env = SurveillanceEnv(world, config.num_envs, device, seed=config.seed)
         nominal = make_controller(config.controller or "", world, seed=config.seed)
     policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
-    steps = config.steps or world.horizon or 1000
+    steps = config.steps or rollout_steps(world.horizon)
     metrics, statistics, trajectory = evaluate_policy(env, policy, steps, record=config.pictures)
     content = {**metrics, "filter": statistics, "steps": steps, "num_envs": config.num_envs, "seed": config.seed}
     write_json(folder / "eval.json", content)

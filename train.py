@@ -23,7 +23,7 @@ from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import TrainingRecorder
 from conf.callbacks import one_clear_error
-from conf.schema import Config, config_hash, register, to_config, write_json
+from conf.schema import Config, config_hash, register, rollout_steps, to_config, world_sizes, write_json
 from conf.versions import git_hash, package_versions
 from envs import SurveillanceEnv
 from envs.rendering import save_training_curve
@@ -58,17 +58,16 @@ def main(cfg: DictConfig) -> None:
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
     writer = SummaryWriter(str(folder))
     bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=1.0)
-    sizes = {"n_agents": config.env.n_agents, "dimension": config.env.dimension, "n_observation": env.n_observation}
 
     def evaluate() -> tuple[dict, dict]:
         eval_env.set_seed(seeds[3])  # the same start states every time
-        steps = config.eval.steps or config.env.horizon or 1000
+        steps = config.eval.steps or rollout_steps(config.env.horizon)
         metrics, statistics, _ = evaluate_policy(eval_env, policy, steps)
         return metrics, statistics
 
     def checkpoint() -> None:
         content = {
-            "world": sizes,
+            "world": world_sizes(env),
             "seed": config.seed,
             "actor": actor.state_dict(),
             "loss": loss_module.state_dict(),
@@ -78,7 +77,11 @@ def main(cfg: DictConfig) -> None:
             "recorder": recorder.state_dict(),
         }
         save_checkpoint(folder / "checkpoints" / f"frames_{recorder.frames:012d}.pt", content)
-        for old in sorted((folder / "checkpoints").glob("*.pt"))[: -config.checkpoint.keep or None] if config.checkpoint.keep else []:
+        for old in (
+            sorted((folder / "checkpoints").glob("*.pt"))[: -config.checkpoint.keep or None]
+            if config.checkpoint.keep
+            else []
+        ):
             old.unlink()
 
     def log(scalars: dict[str, float]) -> None:
@@ -86,7 +89,11 @@ def main(cfg: DictConfig) -> None:
             writer.add_scalar(tag, value, recorder.frames)
 
     log_interval = max(1, config.collector.total_frames // 200)
-    next_log, next_eval, next_checkpoint = log_interval, config.eval.interval_frames, config.checkpoint.interval_episodes
+    next_log, next_eval, next_checkpoint = (
+        log_interval,
+        config.eval.interval_frames,
+        config.checkpoint.interval_episodes,
+    )
     seconds = {"collect": 0.0, "update": 0.0, "eval": 0.0}
     metrics = None
     mark = time.perf_counter()
@@ -103,13 +110,14 @@ def main(cfg: DictConfig) -> None:
         if recorder.frames >= next_log:
             next_log += log_interval
             scalars = recorder.scalars()
-            log(scalars | ({f"loss/{name}": float(value) for name, value in metrics.items()} if metrics is not None else {}))
+            log(
+                scalars
+                | ({f"loss/{name}": float(value) for name, value in metrics.items()} if metrics is not None else {})
+            )
             log({f"time/{name}_s": value for name, value in seconds.items()} | {"train/noise": explore_policy[1].sigma})
             log({"time/frames_per_second": recorder.frames / (time.perf_counter() - start)})
-            violations = sum(recorder.violations.values())
-            bar.set_postfix_str(
-                f"return {scalars.get('train/return', float('nan')):.1f} J {scalars['train/coverage_cost']:.3f} violations {violations}"
-            )
+            shown = f"return {scalars.get('train/return', float('nan')):.1f} J {scalars['train/coverage_cost']:.3f}"
+            bar.set_postfix_str(f"{shown} violations {sum(recorder.violations.values())}")
         bar.update(batch.numel())
         if config.eval.interval_frames and recorder.frames >= next_eval:
             next_eval += config.eval.interval_frames
@@ -127,7 +135,9 @@ def main(cfg: DictConfig) -> None:
 
     checkpoint()
     result, _ = evaluate()
-    save_training_curve({name: np.array(rows) for name, rows in recorder.episodes.finished.items()}, folder / "figures/training.png")
+    save_training_curve(
+        {name: np.array(rows) for name, rows in recorder.episodes.finished.items()}, folder / "figures/training.png"
+    )
     wall = time.perf_counter() - start
     summary = {
         "config_hash": config_hash(cfg),

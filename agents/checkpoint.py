@@ -61,7 +61,9 @@ def latest_checkpoint(run: Path) -> Path:
     """
     found = sorted((run / "checkpoints").glob("*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
     if not found:
-        raise CheckpointError(f"run={run} has no checkpoint in {run / 'checkpoints'}: give the folder of a run that wrote one.")
+        raise CheckpointError(
+            f"run={run} has no checkpoint in {run / 'checkpoints'}: give the folder of a run that wrote one."
+        )
     return found[-1]
 
 
@@ -76,7 +78,9 @@ def check_world(path: Path, found: dict, needed: dict) -> None:
     Raises:
         CheckpointError: naming each size that differs.
     """
-    different = [f"{name} is {found.get(name)} there, {value} here" for name, value in needed.items() if found.get(name) != value]
+    different = [
+        f"{name} is {found.get(name)} there, {value} here" for name, value in needed.items() if found.get(name) != value
+    ]
     if different:
         raise CheckpointError(
             f"checkpoint {path} is of another world: {'; '.join(different)}. Use the world that the run was trained in "

@@ -51,7 +51,9 @@ class AgentConfig:
         for name in ("actor_cells", "critic_cells"):
             cells = getattr(self, name)
             if not cells:
-                raise ValueError(f"agent.{name}=[] is empty: give the hidden units of at least one layer, such as [64,64].")
+                raise ValueError(
+                    f"agent.{name}=[] is empty: give the hidden units of at least one layer, such as [64,64]."
+                )
             for cell in cells:
                 check_range(f"agent.{name}", cell, 1, 4096)
         for name in ("actor_lr", "critic_lr", "tau", "ou_theta"):

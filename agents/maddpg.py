@@ -31,7 +31,11 @@ class MADDPGLoss(DDPGLoss):
     """
 
     def __init__(
-        self, actor_network: TensorDictModuleBase, value_network: TensorDictSequential, agent: AgentConfig, max_speed: float
+        self,
+        actor_network: TensorDictModuleBase,
+        value_network: TensorDictSequential,
+        agent: AgentConfig,
+        max_speed: float,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True, reduction="none")
         self.agent = agent
@@ -59,7 +63,11 @@ class MADDPGLoss(DDPGLoss):
 
 
 def make_loss(
-    actor: TensorDictModule, critic: TensorDictSequential, agent: AgentConfig, safety: SafetyConfig, world: SurveillanceConfig
+    actor: TensorDictModule,
+    critic: TensorDictSequential,
+    agent: AgentConfig,
+    safety: SafetyConfig,
+    world: SurveillanceConfig,
 ) -> tuple[MADDPGLoss, SoftUpdate]:
     """Loss module and target updater.
 

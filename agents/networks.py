@@ -116,7 +116,9 @@ class ExplorationNoise(TensorDictModuleBase):
         device: where the generator lives.
     """
 
-    def __init__(self, agent: AgentConfig, world: SurveillanceConfig, seed: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, agent: AgentConfig, world: SurveillanceConfig, seed: int, device: torch.device | str = "cpu"
+    ) -> None:
         super().__init__()
         self.in_keys = [keys.NOMINAL_ACTION, keys.STEP_COUNT]
         self.out_keys = [keys.NOMINAL_ACTION]
@@ -159,7 +161,9 @@ class ExplorationNoise(TensorDictModuleBase):
 
 def make_actor(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictModule:
     """Actor networks as a module from observation to nominal action."""
-    return TensorDictModule(BallActor(n_observation, world, agent), in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION])
+    return TensorDictModule(
+        BallActor(n_observation, world, agent), in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION]
+    )
 
 
 def make_critic(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictSequential:
@@ -176,7 +180,12 @@ def make_critic(n_observation: int, world: SurveillanceConfig, agent: AgentConfi
 
 
 def make_policies(
-    actor: TensorDictModuleBase, world: SurveillanceConfig, safety: SafetyConfig, agent: AgentConfig, seed: int, device: torch.device
+    actor: TensorDictModuleBase,
+    world: SurveillanceConfig,
+    safety: SafetyConfig,
+    agent: AgentConfig,
+    seed: int,
+    device: torch.device,
 ) -> tuple[TensorDictSequential, TensorDictSequential]:
     """Deployment policy ``actor -> filter`` and exploration policy ``actor -> noise -> filter``.
 

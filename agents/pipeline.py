@@ -26,7 +26,9 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def make_collector(env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, total_frames: int) -> Collector:
+def make_collector(
+    env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, total_frames: int
+) -> Collector:
     """TorchRL collector of ``(num_envs, T)`` batches; warm-up uses the policy, never the environment's random action."""
     return Collector(
         env,

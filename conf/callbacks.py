@@ -4,7 +4,9 @@ import functools
 import os
 import sys
 import textwrap
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -13,7 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from conf.schema import to_config
+from conf.schema import check_evaluation, to_config
 
 EXPECTED = (ValueError, KeyError, OSError, OmegaConfBaseException)
 
@@ -33,19 +35,29 @@ class ValidateConfig(Callback):
     by one when they start: a bad one must not end the others.
     """
 
+    check = staticmethod(to_config)
+
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Before the run folder exists."""
         try:
-            to_config(config)
+            self.check(config)
         except EXPECTED as error:
             if config.get("debug", False):
                 raise SystemExit(_traceback(error)) from error
             fail(error)
+        folder = Path(str(config.hydra.run.dir))
+        if config.get("resume") == "auto" and (folder / "summary.json").is_file():
+            sys.stderr.write(f"{folder} holds a finished run: nothing to do. resume=never trains it anew.\n")
+            sys.exit(0)
+
+
+class ValidateEvaluation(ValidateConfig):
+    """The same for evaluate.py, with the run that it names."""
+
+    check = staticmethod(check_evaluation)
 
 
 def _traceback(error: BaseException) -> str:
-    import traceback
-
     return "".join(traceback.format_exception(error))
 
 

@@ -10,8 +10,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import AgentConfig
+from agents.checkpoint import check_world, latest_checkpoint, load_checkpoint
 from agents.controllers import CONTROLLERS
-from envs import SurveillanceConfig
+from agents.pipeline import pick_device
+from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
 from safety import SafetyConfig
 
@@ -177,17 +179,22 @@ class EvaluateConfig:
         check_range("steps", self.steps, 0, 10**9)
         check_range("num_envs", self.num_envs, 1, 10**6)
         if (self.run is None) == (self.controller is None):
-            raise ValueError(f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>.")
+            raise ValueError(
+                f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>."
+            )
         if self.controller is not None:
             check_choice("controller", self.controller, tuple(CONTROLLERS))
         if self.run is not None and not (Path(self.run) / ".hydra" / "config.yaml").is_file():
-            raise ValueError(f"run={self.run} is not the folder of a run: {self.run}/.hydra/config.yaml does not exist.")
+            raise ValueError(
+                f"run={self.run} is not the folder of a run: {self.run}/.hydra/config.yaml does not exist."
+            )
         self.safety.gains(self.env)
 
 
 def _check_common(config: Any) -> None:
     check_range("seed", config.seed, 0, 2**31)
     check_choice("device", config.device, DEVICES)
+    pick_device(config.device)  # refuses cuda where there is none, before a folder exists
 
 
 def register() -> None:
@@ -211,6 +218,31 @@ def to_config(cfg: DictConfig) -> Any:
     return OmegaConf.to_object(own)
 
 
+def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
+    """Configuration of the run ``cfg.run`` with the command line's env and safety overrides applied to it."""
+    given = OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.load(Path(cfg.run) / ".hydra" / "config.yaml"))
+    for override in overrides:
+        key = override.split("=")[0].lstrip("+~")
+        if key.split(".")[0] in ("env", "safety"):
+            OmegaConf.update(given, key, OmegaConf.select(cfg, key), merge=False)
+    given.device = cfg.device  # the run may have been trained elsewhere
+    return to_config(given)
+
+
+def world_sizes(env: SurveillanceEnv) -> dict[str, int]:
+    """The sizes that networks are made for."""
+    return {"n_agents": env.config.n_agents, "dimension": env.config.dimension, "n_observation": env.n_observation}
+
+
+def check_evaluation(cfg: DictConfig) -> None:
+    """Raise what is wrong with an evaluation before anything is written: values, run folder, checkpoint, its world."""
+    config = to_config(cfg)
+    if config.run is not None:
+        world = run_config(cfg, list(cfg.hydra.overrides.task)).env
+        path = latest_checkpoint(Path(config.run))
+        check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(world)))
+
+
 def config_hash(cfg: DictConfig) -> str:
     """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
     names = [str(name) for name in cfg if name not in NOT_HASHED]
@@ -225,13 +257,22 @@ def _plain(cfg: DictConfig, name: str) -> Any:
 
 def evaluation_folder(cfg: DictConfig) -> str:
     """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers."""
-    choices = cfg.hydra.runtime.choices
-    if cfg.run is None:
-        return f"runs/controllers/{cfg.controller}_{choices.safety}_{choices.env}_{cfg.steps}_{cfg.seed}_{config_hash(cfg)}"
-    given = OmegaConf.load(Path(cfg.run) / ".hydra" / "hydra.yaml")
-    overridden = any(str(entry).startswith("env=") for entry in cfg.hydra.overrides.task)
-    world = choices.env if overridden else given.hydra.runtime.choices.env
-    return f"{cfg.run}/eval/{world}_{cfg.steps}_{cfg.seed}"
+    choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
+    world, horizon = choices.env, cfg.env.horizon
+    if cfg.run is not None and not any(entry.startswith("env=") for entry in overrides):
+        hydra_folder = Path(cfg.run) / ".hydra"
+        world = OmegaConf.load(hydra_folder / "hydra.yaml").hydra.runtime.choices.env
+        if not any(entry.startswith("env.horizon=") for entry in overrides):
+            horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
+    name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    if cfg.run is not None:
+        return f"{cfg.run}/eval/{name}"
+    return f"runs/controllers/{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
+
+
+def rollout_steps(horizon: int) -> int:
+    """Length of an evaluation that gives none: one episode, or 1000 steps where episodes do not end."""
+    return horizon or 1000
 
 
 def write_json(path: Path, content: dict) -> None:

@@ -43,9 +43,9 @@ class SurveillanceConfig:
     """Length of one step, s, (0, 10]."""
     max_speed: float = 0.2
     """Speed limit (Euclidean norm), m/s, (0, 100]."""
-    arena: list[list[float]] = field(default_factory=lambda: [[-1.0, 1.0], [-1.0, 1.0]])
+    arena: list[Any] = field(default_factory=lambda: [[-1.0, 1.0], [-1.0, 1.0]])
     """[low, high] per axis, m; a missing third axis repeats the last row."""
-    stations: list[list[float]] = field(default_factory=list)
+    stations: list[Any] = field(default_factory=list)
     """Station centres, m; empty = one per robot, evenly spaced along the arena's walls. A missing third coordinate is the floor."""
     slots: Any = 1
     """Slots per station (int, 1..16; several stand on a ring of slot_radius) or the list of all slot positions, m."""
@@ -73,7 +73,7 @@ class SurveillanceConfig:
     """Steps until an episode is truncated; 0 = never."""
     density: str = "gaussian_mixture"
     """Family of the density: uniform | gaussian_mixture | moving | age."""
-    density_centers: list[list[float]] = field(default_factory=lambda: [[-0.45, -0.35], [0.5, -0.15], [0.0, 0.55]])
+    density_centers: list[Any] = field(default_factory=lambda: [[-0.45, -0.35], [0.5, -0.15], [0.0, 0.55]])
     """Centres of the Gaussian components, m; a missing third coordinate is the middle of the arena."""
     density_sigma: float = 0.3
     """Standard deviation of every Gaussian component, m, (0, 100]."""
@@ -90,7 +90,7 @@ class SurveillanceConfig:
     resolution: int = 0
     """Quadrature points per axis, 2..512; 0 = 20 in 2-D and 10 in 3-D (RMS error of J below 1 %)."""
     on_violation: str = "terminate"
-    """terminate: the first violation ends the episode. continue: every violating robot-step counts, a drained robot stands still."""
+    """terminate: the first violation ends the episode. continue: every one counts, a drained robot stands still."""
     reserve: str = "linear"
     """Reserve family rho: linear (drive home at homing_speed) | logarithmic (exponential approach; needs more reserve)."""
     homing_speed: float = 0.98
@@ -122,7 +122,7 @@ class SurveillanceConfig:
     def bounds(self) -> list[list[float]]:
         """``[low, high]`` per axis, ``d`` rows, m."""
         rows = [[float(low), float(high)] for low, high in self.arena]
-        return (rows + [rows[-1]])[: self.dimension]
+        return [*rows, rows[-1]][: self.dimension]
 
     @property
     def diameter(self) -> float:
@@ -164,7 +164,9 @@ class SurveillanceConfig:
     @property
     def max_drain_rate(self) -> float:
         """Drain at ``max_speed``, energy/s: what the reserve counts with."""
-        return self.drain_rate + self.drain_per_speed * self.max_speed + self.drain_per_speed_squared * self.max_speed**2
+        return (
+            self.drain_rate + self.drain_per_speed * self.max_speed + self.drain_per_speed_squared * self.max_speed**2
+        )
 
     @property
     def break_even_radius(self) -> float:
@@ -182,7 +184,9 @@ class SurveillanceConfig:
         linear = self.reserve == "linear"
         unit = torch.finfo(self.torch_dtype).eps / 2
         reach = max(abs(x) for row in self.bounds for x in row)
-        steps_home = math.ceil(self.diameter / (speed * self.dt)) if linear else math.ceil(-math.log(unit) / (gain * self.dt))
+        steps_home = (
+            math.ceil(self.diameter / (speed * self.dt)) if linear else math.ceil(-math.log(unit) / (gain * self.dt))
+        )
         energy_scale = self.energy_max + self.max_drain_rate * (self.diameter + reach) / speed
         eps_energy = max(1e-4 * (self.energy_max - self.energy_min), 4 * steps_home * unit * energy_scale)
         eps_distance = max(5e-3 * self.safety_distance, 8 * steps_home * unit * reach)
@@ -203,6 +207,10 @@ class SurveillanceConfig:
 
     # ---- checks ---------------------------------------------------------------------------------------------------
     def _check_fields(self) -> None:
+        for name in ("n_agents", "dimension", "horizon", "resolution"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise ValueError(f"env.{name}={value!r} must be a whole number.")
         check_range("env.n_agents", self.n_agents, 1, MAX_AGENTS)
         if self.dimension not in (2, 3):
             raise ValueError(f"env.dimension={self.dimension} is not supported: choose 2 (ground) or 3 (aerial).")
@@ -241,7 +249,7 @@ class SurveillanceConfig:
         check_choice("env.dtype", self.dtype, ("float32", "float64"))
 
     def _check_layout(self) -> None:
-        if not self.arena or len(self.arena) > 3 or any(len(row) != 2 for row in self.arena) or len(self.arena) < 2:
+        if not _is_table(self.arena, (2,)) or len(self.arena) not in (2, 3):
             raise ValueError(f"env.arena={self.arena} must be 2 or 3 rows [low, high] in metres.")
         if any(not low < high for low, high in self.bounds):
             raise ValueError(f"env.arena={self.arena} is empty: every row needs low < high.")
@@ -250,27 +258,29 @@ class SurveillanceConfig:
             check_range("env.slots", self.slots, 1, 16, hint="Or give the list of slot positions.")
         for name in ("stations", "density_centers") + (() if is_count else ("slots",)):
             rows = getattr(self, name)
-            if not isinstance(rows, list) or any(
-                not isinstance(row, list) or len(row) not in (2, self.dimension) for row in rows
-            ):
-                raise ValueError(f"env.{name}={rows} must be a list of positions with 2 or {self.dimension} coordinates in metres.")
+            if not _is_table(rows, (2, self.dimension)):
+                raise ValueError(
+                    f"env.{name}={rows} must be a list of positions [x, y{', z' * (self.dimension - 2)}] in metres."
+                )
         if not self.density_centers:
             raise ValueError("env.density_centers=[] is empty: give at least one centre.")
         slots = self.slot_positions
         if len(slots) < self.n_agents:
             raise ValueError(
-                f"env.slots: {len(slots)} slots for env.n_agents={self.n_agents} robots; every robot needs a slot of its own. "
+                f"env.stations, env.slots: {len(slots)} slots for env.n_agents={self.n_agents} robots, every robot needs its own. "
                 "Add stations, raise env.slots, or leave env.stations=[] for one station per robot."
             )
         for slot in slots:
             if any(not low <= x <= high for x, (low, high) in zip(slot, self.bounds, strict=True)):
-                raise ValueError(f"env.slots: slot {_rounded(slot)} is outside env.arena={self.bounds}. Move its station inwards.")
+                raise ValueError(
+                    f"env.slots: slot {_rounded(slot)} is outside env.arena={self.bounds}. Move its station inwards."
+                )
         needed = self.homing.clearance + self.homing.eps_distance
         for i, a in enumerate(slots):
             for b in slots[:i]:
                 if math.dist(a, b) <= needed:
                     raise ValueError(
-                        f"env.slots: slots {_rounded(b)} and {_rounded(a)} overlap: they are {math.dist(a, b):.4g} m apart, "
+                        f"env.stations, env.slots: slots {_rounded(b)} and {_rounded(a)} overlap: {math.dist(a, b):.4g} m apart, "
                         f"two docked robots need more than {needed:.4g} m. Move stations apart or raise env.slot_radius."
                     )
 
@@ -314,6 +324,16 @@ class SurveillanceConfig:
             dx, dy = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}[[c[0] for c in corners].index(start)]
             rows.append([x + dx * along, y + dy * along])
         return self._complete(rows, floor=True)
+
+
+def _is_table(rows: Any, widths: tuple[int, ...]) -> bool:
+    """Whether ``rows`` is a list of rows of finite numbers, each as long as one of ``widths``."""
+    return isinstance(rows, list) and all(
+        isinstance(row, list)
+        and len(row) in widths
+        and all(isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in row)
+        for row in rows
+    )
 
 
 def _rounded(row: list[float]) -> list[float]:

@@ -1,8 +1,9 @@
 """Voronoi coverage: the locational cost J and its gradient by quadrature on a regular grid.
 
 ``J(x) = int min_i ||p_i - q||^2 phi(q) dq`` with the density normalised to 1. Every cell of the grid is represented by
-its centre plus, by the parallel axis theorem, its own second moment, which makes the midpoint rule exact for a
-quadratic integrand.
+its centre. For a density that does not vanish at the walls the cell's own second moment is added (parallel axis
+theorem: exact for one robot and a uniform density); for a smooth density inside the arena the midpoint rule needs no
+correction and the moment would be a bias.
 """
 
 import math
@@ -30,8 +31,11 @@ def quadrature_points(bounds: list[list[float]], resolution: int, **factory) -> 
 def squared_distances(position: Tensor, points: Tensor) -> Tensor:
     """Squared distances of robots and points, ``(*B, N, d), (Q, d) -> (*B, N, Q)``, m^2.
 
-    Written as ``|p|^2 - 2 p.q + |q|^2`` (one matrix product), with at most rounding below zero removed.
+    Written as ``|p|^2 - 2 p.q + |q|^2`` (one matrix product) about the middle of the points, so that an arena far from
+    the origin loses no digits; with at most rounding below zero removed.
     """
+    middle = points.mean(dim=0)
+    position, points = position - middle, points - middle
     cross = position @ points.T
     norms = position.square().sum(-1, keepdim=True) + points.square().sum(-1)
     return (norms - 2 * cross).clamp_min(0)
@@ -44,7 +48,7 @@ def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment
         position: ``(*B, N, d)``, m.
         points: ``(Q, d)``, m.
         weights: ``(Q,)`` or ``(*B, Q)``, summing to 1.
-        cell_moment: second moment of one cell, m^2, from :func:`quadrature_points`.
+        cell_moment: correction for the cells' own extent, m^2, see :class:`envs.density.Density`.
 
     Returns:
         ``(*B,)``, m^2.

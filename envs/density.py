@@ -20,7 +20,7 @@ class Density:
 
     Attributes:
         points: ``(Q, d)``, m.
-        cell_moment: second moment of one quadrature cell, m^2.
+        cell_moment: second moment of one quadrature cell, m^2; 0 for the Gaussian families, where adding it would bias J.
         n_params: parameters per world, 0 where the density is constant.
         n_observed: numbers per world that a robot observes of it.
     """
@@ -29,7 +29,8 @@ class Density:
         factory = {"dtype": config.torch_dtype, "device": device}
         self.config = config
         self.family = config.density
-        self.points, self.cell_moment = quadrature_points(config.bounds, config.quadrature_resolution, **factory)
+        self.points, moment = quadrature_points(config.bounds, config.quadrature_resolution, **factory)
+        self.cell_moment = moment if self.family in ("uniform", "age") else 0.0
         self.bounds = torch.tensor(config.bounds, **factory)
         self.centers = torch.tensor(config.density_center_positions, **factory)
         n_points, (n_centers, dimension) = len(self.points), self.centers.shape
@@ -49,7 +50,11 @@ class Density:
         if self.family == "moving":
             return 2 * math.pi * unit
         low, high = self.bounds.unbind(-1)
-        return (low + (high - low) * (0.1 + 0.8 * unit.unflatten(-1, (-1, len(low))))).flatten(-2) if self.n_params else unit
+        return (
+            (low + (high - low) * (0.1 + 0.8 * unit.unflatten(-1, (-1, len(low))))).flatten(-2)
+            if self.n_params
+            else unit
+        )
 
     def advance(self, params: Tensor, nearest_squared: Tensor) -> Tensor:
         """Parameters one step later.
@@ -85,8 +90,8 @@ class Density:
             importance = params + self.config.dt  # never all zero
             return importance / importance.sum(-1, keepdim=True)
         offset = self.points.unsqueeze(-2) - self.component_centers(params).unsqueeze(-3)
-        mixture = (offset.square().sum(-1) * (-0.5 / self.config.density_sigma**2)).exp().sum(-1)
-        return mixture / mixture.sum(-1, keepdim=True)
+        exponent = offset.square().sum(-1) * (-0.5 / self.config.density_sigma**2)
+        return exponent.logsumexp(-1).softmax(-1)  # finite also where every component underflows
 
     def observe(self, params: Tensor) -> Tensor:
         """What a robot may know of a density that varies, ``(B, n_observed)``, of order one."""

@@ -118,7 +118,9 @@ def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGe
     step = geometry.speed * geometry.dt
     whole = (distance / step).floor()
     zero = torch.zeros_like(whole[..., i])
-    times, _ = torch.stack([zero, whole[..., i], whole[..., i] + 1, whole[..., j], whole[..., j] + 1], dim=-1).sort(dim=-1)
+    times, _ = torch.stack([zero, whole[..., i], whole[..., i] + 1, whole[..., j], whole[..., j] + 1], dim=-1).sort(
+        dim=-1
+    )
 
     def path(robot: Tensor) -> Tensor:
         """Position of ``robot`` at ``times``, ``(*B, P, 5, d)``."""
@@ -138,7 +140,13 @@ def segment_distance(start: Tensor, end: Tensor) -> Tensor:
 
 
 def is_certified(
-    position: Tensor, energy: Tensor, slot_position: Tensor, geometry: HomingGeometry, bounds: Tensor, *, clearance: float = 0.0
+    position: Tensor,
+    energy: Tensor,
+    slot_position: Tensor,
+    geometry: HomingGeometry,
+    bounds: Tensor,
+    *,
+    clearance: float = 0.0,
 ) -> Tensor:
     """Whether a joint state is in the certified set, with the margins demanded on entry (two rounding margins).
 
@@ -157,7 +165,9 @@ def is_certified(
     margin = energy - geometry.energy_min - 2 * geometry.eps_energy - reserve(distance, geometry)
     inside = ((position >= bounds[:, 0]) & (position <= bounds[:, 1])).all(dim=-1)
     robots = ((margin >= 0) & (energy <= geometry.energy_max) & inside).all(dim=-1)
-    apart = closest_approach(position, slot_position, geometry) >= geometry.clearance + geometry.eps_distance + clearance
+    apart = (
+        closest_approach(position, slot_position, geometry) >= geometry.clearance + geometry.eps_distance + clearance
+    )
     return robots & apart.all(dim=-1)
 
 

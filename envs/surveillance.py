@@ -145,14 +145,14 @@ class SurveillanceEnv(EnvBase):
         Raises:
             ValueError: if the state belongs to another world or another number of worlds.
         """
-        given = TensorDict(state_dict["state"], self.batch_size if "state" in state_dict else [])
+        given = TensorDict(state_dict["state"], [])
         for name, value in self._state.items():
             if name not in given or given[name].shape != value.shape:
                 raise ValueError(
                     f"state {name!r} has shape {tuple(given[name].shape) if name in given else None}, this environment needs "
                     f"{tuple(value.shape)}: the checkpoint is of another world or another collector.num_envs."
                 )
-        self._state = given.to(self.device)
+        self._state = TensorDict(dict(given.items()), self.batch_size, device=self.device)
         self.generator.set_state(state_dict["generator"].cpu())
 
     def set_state(self, position: Tensor, energy: Tensor, slot: Tensor | None = None) -> TensorDictBase:
@@ -170,7 +170,8 @@ class SurveillanceEnv(EnvBase):
         self._state["energy"] = energy.to(self.bounds).squeeze(-1).expand(self._robots).clone()
         if slot is not None:
             self._state["slot"] = slot.to(self.device).squeeze(-1).expand(self._robots).clone()
-        return self.reset(TensorDict({"_reset": torch.zeros(*self.batch_size, 1, dtype=torch.bool)}, self.batch_size))
+        nobody = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
+        return self._reset(TensorDict({"_reset": nobody}, self.batch_size))
 
     # ---- physics ---------------------------------------------------------------------------------------------------
     def transition(self, position: Tensor, energy: Tensor, velocity: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,9 +218,9 @@ class SurveillanceEnv(EnvBase):
         full = torch.full_like(share, c.energy_max)
         for _ in range(n):  # rounds of the exchange, not robots: every round improves all worlds at once
             slot = exchange_slots(position, full, slot, self.slots, g)
-        least = c.energy_min + 2 * g.eps_energy + c.reset_reserve * span
-        need = least + reserve((position - self.slots[slot]).norm(dim=-1), g)
         top = c.energy_max - g.eps_energy
+        least = min(c.energy_min + 2 * g.eps_energy + c.reset_reserve * span, top)
+        need = least + reserve((position - self.slots[slot]).norm(dim=-1), g)
         energy = need + (top - need).clamp_min(0) * share
         clearance = c.reset_clearance
         certified = is_certified(position, energy, self.slots[slot], g, self.bounds, clearance=clearance)
@@ -353,7 +354,9 @@ class SurveillanceEnv(EnvBase):
             shape=self.batch_size,
             device=self.device,
         )
-        self.reward_spec = Composite({keys.AGENTS: agents(reward=unbounded(n, 1))}, shape=self.batch_size, device=self.device)
+        self.reward_spec = Composite(
+            {keys.AGENTS: agents(reward=unbounded(n, 1))}, shape=self.batch_size, device=self.device
+        )
         done = {name: flag(1) for name in ("done", "terminated", "truncated")}
         done[keys.AGENTS] = agents(**{name: flag(n, 1) for name in ("done", "terminated", "truncated")})
         self.done_spec = Composite(done, shape=self.batch_size, device=self.device)

@@ -30,7 +30,13 @@ class BarrierRow(NamedTuple):
 
 
 def energy_barrier(
-    position: Tensor, energy: Tensor, slot_position: Tensor, field: Tensor, geometry: HomingGeometry, *, charge_rate: float
+    position: Tensor,
+    energy: Tensor,
+    slot_position: Tensor,
+    field: Tensor,
+    geometry: HomingGeometry,
+    *,
+    charge_rate: float,
 ) -> BarrierRow:
     """Survivability ``h_c = E - E_min - rho(||p - sigma||)``: enough energy to drive home.
 
@@ -69,7 +75,14 @@ def energy_barrier(
 
 
 def sampled_energy_row(
-    position: Tensor, energy: Tensor, next_energy: Tensor, slot_position: Tensor, geometry: HomingGeometry, *, gain: float, step: float
+    position: Tensor,
+    energy: Tensor,
+    next_energy: Tensor,
+    slot_position: Tensor,
+    geometry: HomingGeometry,
+    *,
+    gain: float,
+    step: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Survivability row that holds over a whole step: ``h_c(k+1) >= (1 - gain) h_c(k)`` on the exact one-step map.
 
@@ -109,7 +122,9 @@ def sampled_energy_row(
     return value, 2 * geometry.dt * offset, torch.where(distance <= radius - step, torch.inf, bound)
 
 
-def overcharge_barrier(energy: Tensor, field: Tensor, *, energy_max: float, drain_rate: float, charge_rate: float) -> BarrierRow:
+def overcharge_barrier(
+    energy: Tensor, field: Tensor, *, energy_max: float, drain_rate: float, charge_rate: float
+) -> BarrierRow:
     """Overcharge ``h_o = E_max - E``, of relative degree one through the accepted current.
 
     Args:

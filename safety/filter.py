@@ -80,7 +80,9 @@ class SafetyFilter(TensorDictModuleBase):
         inputs = [tensordict.get(key, None) for key in self.in_keys]
         missing = [key for key, value in zip(self.in_keys, inputs, strict=True) if value is None]
         if missing:
-            raise KeyError(f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}.")
+            raise KeyError(
+                f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}."
+            )
         nominal, position, energy, slot = inputs
         outputs = self.filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
         for key, value in zip(self.out_keys, outputs, strict=True):
@@ -123,7 +125,14 @@ class SafetyFilter(TensorDictModuleBase):
         )
 
     def _program(
-        self, target: Tensor, position: Tensor, energy: Tensor, slot: Tensor, h_c: BarrierRow, h_o: BarrierRow, h_s: BarrierRow
+        self,
+        target: Tensor,
+        position: Tensor,
+        energy: Tensor,
+        slot: Tensor,
+        h_c: BarrierRow,
+        h_o: BarrierRow,
+        h_s: BarrierRow,
     ) -> tuple[Tensor, ...]:
         """Rows, current and solution: ``(action, current, status, residual)``."""
         alpha_c, alpha_o, alpha_s = self.gains
@@ -241,7 +250,9 @@ class SafetyFilter(TensorDictModuleBase):
         """Rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
         world = self.world
         stations, slots = self._layout(position)
-        field = charging_field(position, stations, full_radius=world.charge_radius_full, zero_radius=world.charge_radius)
+        field = charging_field(
+            position, stations, full_radius=world.charge_radius_full, zero_radius=world.charge_radius
+        )
         rates = {"charge_rate": world.charge_rate}
         return (
             energy_barrier(position, energy, slots[slot], field, self.literal, **rates),

@@ -253,17 +253,28 @@ class _SolveQP(torch.autograd.Function):
         return dQ, dp, dG, dh, None, None
 
 
+def _step_to_boundary(v: Tensor, dv: Tensor) -> Tensor:
+    """Longest step with v + step dv ≥ 0, (B, m), (B, m) -> (B,). qpth's own is -inf, and all is NaN, where a dv is 0."""
+    return torch.where(dv < 0, -v / dv, 1e6).amin(1)
+
+
 def _interior_point(Q: Tensor, p: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Stock qpth without a word on stdout: u (B, n), multipliers (B, m), slacks (B, m); zeros where it broke down."""
+    """Run qpth, its step length mended, without a word on stdout: u (B, n), multipliers (B, m), slacks (B, m).
+
+    Zeros (slacks: ones) where it broke down.
+    """
     parts = []
     step = max(1, CHUNK_BYTES // (8 * 8 * G.shape[1] ** 2))
     none = Q.new_empty(0)
     for q, c, rows, b in zip(Q.split(step), p.split(step), G.split(step), h.split(step), strict=True):
         pdipm.factor_kkt_eye = None  # a global that qpth reuses by shape only, whatever the device
+        stock, pdipm.get_step = pdipm.get_step, _step_to_boundary
         try:
             x, _, z, s = pdipm.forward(q, c, rows, b, none, none, *pdipm.pre_factor_kkt(q, rows, none), **_QPTH)
         except RuntimeError:  # singular to the last bit; the guard sees a failed sample and tries again
             x = z = s = None
+        finally:
+            pdipm.get_step = stock
         parts.append((torch.zeros_like(c), torch.zeros_like(b), torch.ones_like(b)) if x is None else (x, z, s))
     x, z, s = (torch.cat(column) for column in zip(*parts, strict=True))
     return torch.nan_to_num(x, 0.0, 0.0, 0.0), torch.nan_to_num(z, 0.0, 0.0, 0.0), torch.nan_to_num(s, 1.0, 1.0, 1.0)
@@ -327,10 +338,13 @@ def _solve_qpth(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, tol: float) -> Raw:
     reach = torch.where(reach > 0, reach, 1.0)
     sum_abs = rows.abs().sum(-1)
     raw = Raw.blank(metric.up(t), h.shape[1])
-    raw.residual.fill_(torch.inf)
-    gap = torch.where(impossible, torch.inf, torch.zeros_like(reach))
+    usable, zero = ~impossible & ~metric.bad, torch.zeros_like(reach)
+    # Where no row is violated the unconstrained minimiser is the answer, for Q = I bit for bit.
+    free = kkt_residual(Q, p, G, h, raw.u, torch.zeros_like(h), zero, None)
+    raw = raw._replace(residual=torch.where(usable & (excess <= 0), free, torch.inf))
+    gap = torch.where(impossible, torch.inf, zero)
     eye = torch.eye(n, dtype=Q.dtype, device=Q.device)
-    todo = (~impossible & ~metric.bad).nonzero()[:, 0]
+    todo = (usable & (raw.residual > tol)).nonzero()[:, 0]
     for attempt, factor in enumerate(_BOUND_FACTORS):
         if not len(todo):
             break

@@ -17,10 +17,9 @@ class FilterStatistics:
 
     def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
-        self.sums = {
-            name: 0.0
-            for name in ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside")
-        }
+        self.sums = dict.fromkeys(
+            ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside"), 0.0
+        )
         self.max_residual = 0.0
 
     def update(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> None:
@@ -32,7 +31,10 @@ class FilterStatistics:
         """
         status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
         correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
-        barriers = [tensordict[key].squeeze(-1) for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)]
+        barriers = [
+            tensordict[key].squeeze(-1)
+            for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)
+        ]
         counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
         outside = ~torch.stack([h >= 0 for h in barriers]).all(dim=0)
         rows = (

@@ -1,0 +1,142 @@
+import dataclasses
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+import evaluate
+import train
+from conf.schema import Config, config_hash, to_config
+
+CONF = Path(__file__).parents[1] / "conf"
+GROUPS = [
+    (group, path.stem)
+    for group in ("env", "safety", "agent", "train", "experiment")
+    for path in (CONF / group).glob("*.yaml")
+]
+
+
+def composed(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=list(overrides))
+
+
+@pytest.mark.parametrize(("group", "option"), GROUPS)
+def test_every_yaml_composes_and_validates(group, option):
+    config = to_config(composed(f"{group}={option}"))
+    assert isinstance(config, Config)
+
+
+def test_every_field_of_the_schema_can_be_set_from_the_command_line():
+    def leaves(value, prefix):
+        for field in dataclasses.fields(value):
+            inner, name = getattr(value, field.name), f"{prefix}{field.name}"
+            if dataclasses.is_dataclass(inner):
+                yield from leaves(inner, name + ".")
+            else:
+                yield name, inner
+
+    overrides = []
+    for name, value in leaves(Config(), ""):
+        text = "null" if value is None else str(value).replace(" ", "").replace("'", "")
+        overrides.append(f"{name}={text}")
+    assert to_config(composed(*overrides)) == Config()
+
+
+def test_paper_run_is_the_papers_budget():
+    config = to_config(composed("experiment=paper"))
+    assert config.collector.total_frames == 1_000_000
+    assert config.collector.num_envs == 100
+    assert config.collector.frames_per_batch == 100
+    assert config.env.horizon == 100
+    assert config.buffer.batch_size == 256
+    assert config.agent.actor_cells == [64, 64]
+    assert config.agent.critic_cells == [64, 64]
+    assert config.train.n_updates == 1
+    assert config.checkpoint.interval_episodes == 100
+    literal = to_config(composed("experiment=paper_literal"))
+    assert literal.train.n_updates * literal.collector.total_frames // literal.collector.frames_per_batch == 1_000_000
+
+
+def test_literal_filter_is_one_row_with_full_responsibility():
+    safety = to_config(composed("safety=paper")).safety
+    assert (safety.composition, safety.split, safety.sampled_data) == ("min", "full", False)
+    default = to_config(composed()).safety
+    assert (default.mode, default.composition, default.split) == ("paper", "stacked", "half")
+
+
+def test_hash_ignores_what_does_not_change_the_result():
+    reference = config_hash(composed())
+    same = ("seed=5", "device=cpu", "resume=never", "debug=true", "checkpoint.keep=7")
+    assert all(config_hash(composed(override)) == reference for override in same)
+    assert config_hash(composed("env.n_agents=4")) != reference
+
+
+@pytest.mark.parametrize(
+    "override", ["foo=1", "env.foo=1", "env.n_agents=abc", "agent.gamma=high", "safety=unheard_of"]
+)
+def test_unknown_names_and_wrong_types_do_not_compose(override):
+    with pytest.raises((HydraException, OmegaConfBaseException)):
+        composed(override)
+
+
+BAD = [
+    ("env.n_agents=0", "[1, 64]"),
+    ("env.density=foo", "uniform, gaussian_mixture, moving, age"),
+    ("env.stations=[[0,0]]", "1 slots for env.n_agents=3"),
+    ("env.stations=[[0,0],[0,0.05],[0.5,0.5]]", "overlap"),
+    ("env.charge_rate=0.01", "could never charge"),
+    ("env.arena=[[0,1]]", "2 or 3 rows"),
+    ("env.energy_min=2", "energy_max"),
+    ("safety.alpha_s=100", "(0, 5.0]"),
+    ("safety.split=all", "half, full, joint"),
+    ("collector.total_frames=1000", "nearest that is, is 992"),
+    ("agent.gamma=1", "below 1"),
+    ("agent.correction_penalty=1", "safety.in_loss=true"),
+    ("buffer.capacity=1", "one minibatch"),
+    ("device=tpu", "auto, cpu, cuda"),
+    ("resume=maybe", "auto, never"),
+]
+
+
+@pytest.mark.parametrize(("override", "hint"), BAD)
+def test_bad_value_gives_one_clear_error_and_no_folder(program, tmp_path, override, hint):
+    code, output = program(train.main, "experiment=smoke", override)
+    assert code == 1
+    assert override.split("=")[0] in output
+    assert hint in " ".join(output.split())
+    assert "Traceback" not in output
+    assert len(output.strip().splitlines()) <= 8
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ((), "give one of run=<folder> and controller=<name>"),
+        (("controller=unheard_of",), "random, lloyd, charge_when_low, coverage_cbf"),
+        (("run=nowhere",), "is not the folder of a run"),
+        (("controller=lloyd", "run=nowhere"), "give one of"),
+        (("controller=lloyd", "steps=-1"), "steps=-1"),
+    ],
+)
+def test_bad_evaluation_gives_one_clear_error_and_no_folder(program, tmp_path, arguments, hint):
+    code, output = program(evaluate.main, *arguments)
+    assert code == 1
+    assert hint in " ".join(output.split())
+    assert "Traceback" not in output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_shows_the_traceback(program):
+    code, output = program(train.main, "experiment=smoke", "env.n_agents=0", "debug=true")
+    assert code == 1
+    assert "Traceback" in output
+
+
+def test_yaml_files_hold_differences_only():
+    """A value in env/default.yaml would silently differ from SurveillanceConfig() in Python."""
+    assert to_config(composed()) == Config()
+    assert Path(CONF / "env" / "default.yaml").read_text().strip().endswith("{}")

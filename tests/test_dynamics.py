@@ -1,0 +1,94 @@
+"""The speed limit is the identity inside the ball and a projection onto it outside; the integrator is exact."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envs.dynamics import integrate, limit_speed, pair_indices
+
+DTYPES = (torch.float32, torch.float64)
+
+
+def random_velocity(*shape, scale, dtype, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return scale * torch.randn(*shape, generator=generator, dtype=dtype)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_speeds_inside_the_ball_stay_bit_for_bit(d, dtype):
+    velocity = random_velocity(500, 4, d, scale=0.05, dtype=dtype)
+    velocity = velocity[(velocity.norm(dim=-1) < 0.2).all(dim=-1)]
+    velocity[0, 0] = 0
+    velocity[0, 1] = torch.eye(d, dtype=dtype)[0] * 0.2  # exactly on the sphere
+    assert len(velocity) > 100
+    assert torch.equal(limit_speed(velocity, 0.2), velocity)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_speeds_outside_land_on_the_sphere_in_the_same_direction(d, dtype):
+    velocity = random_velocity(500, 4, d, scale=3.0, dtype=dtype)
+    reference = velocity.double().numpy()
+    speed = np.sqrt((reference**2).sum(-1, keepdims=True))
+    expected = np.where(speed > 0.2, 0.2 * reference / speed, reference)
+    assert (speed > 0.2).mean() > 0.9
+    got = limit_speed(velocity, 0.2)
+    assert got.dtype == dtype
+    np.testing.assert_allclose(got.double().numpy(), expected, rtol=1e-6, atol=0)
+    assert got.norm(dim=-1).max() <= 0.2 * (1 + 1e-6)
+
+
+def test_one_fast_robot_does_not_touch_the_others():
+    velocity = torch.tensor([[[0.1, 0.0], [3.0, -4.0], [0.0, -0.2]]])
+    got = limit_speed(velocity, 0.2)
+    assert torch.equal(got[:, [0, 2]], velocity[:, [0, 2]])
+    assert torch.allclose(got[0, 1], torch.tensor([0.12, -0.16]))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_limit_is_idempotent_bit_for_bit(d, dtype):
+    velocity = random_velocity(20_000, 2, d, scale=0.3, dtype=dtype, seed=1)
+    once = limit_speed(velocity, 0.2)
+    assert not torch.equal(once, velocity)
+    assert torch.equal(limit_speed(once, 0.2), once)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3),
+    st.floats(1e-3, 100.0),
+)
+def test_limit_never_exceeds_the_ball(row, max_speed):
+    velocity = torch.tensor(row, dtype=torch.float64).reshape(1, 1, 3)
+    got = limit_speed(velocity, max_speed)
+    assert float(got.norm()) <= max_speed * (1 + 1e-6)
+    assert float((got * velocity).sum()) >= 0
+
+
+def test_not_a_number_is_not_hidden():
+    got = limit_speed(torch.tensor([[[float("nan"), 0.0], [1.0, 0.0]]]), 0.2)
+    assert got[0, 0].isnan().any()
+    assert torch.allclose(got[0, 1], torch.tensor([0.2, 0.0]))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_integrator_is_exact_under_a_held_input(d):
+    generator = torch.Generator().manual_seed(2)
+    position = torch.rand(5, 3, d, generator=generator, dtype=torch.float64)
+    velocity = torch.rand(5, 3, d, generator=generator, dtype=torch.float64) - 0.5
+    state = position
+    for _ in range(40):
+        state = integrate(state, velocity, 0.05)
+    np.testing.assert_allclose(state.numpy(), position.numpy() + 2.0 * velocity.numpy(), atol=1e-13)
+
+
+@pytest.mark.parametrize("n", range(1, 8))
+def test_pairs_come_in_the_order_of_combinations(n):
+    i, j = pair_indices(n)
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == list(combinations(range(n), 2))

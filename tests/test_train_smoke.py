@@ -1,0 +1,134 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import evaluate
+import train
+
+TINY = (
+    *("collector.num_envs=4", "collector.steps_per_batch=2", "collector.total_frames=64", "buffer.batch_size=8"),
+    *("buffer.capacity=64", "train.warmup_frames=16", "train.n_updates=1", "eval.num_envs=2", "eval.steps=5"),
+    *("eval.interval_frames=32", "checkpoint.interval_episodes=1", "env.horizon=6", "device=cpu"),
+)
+VARIANTS = {
+    **{experiment: (f"experiment={experiment}",) for experiment in ("default", "smoke", "paper", "paper_literal")},
+    "literal filter": ("safety=paper",),
+    "unfiltered": ("safety=none",),
+    "joint filter": ("safety.split=joint",),
+    "filter in the loss": ("safety.in_loss=true", "agent.correction_penalty=0.1"),
+    "joint filter in the loss": ("safety.split=joint", "safety.in_loss=true"),
+    "qpth per robot": ("safety.solver=qpth",),
+    "independent learners": ("agent=ddpg",),
+    "shared gradient": ("agent.gradient=shared", "agent.share_params=true"),
+    "own minibatches, OU noise": ("agent.minibatch=per_agent", "agent.noise=ou"),
+    "violation penalty": ("safety=none", "train.violation_penalty=1.0", "env.on_violation=continue"),
+    "aerial": ("env=aerial",),
+    "five robots, float64": ("env=five_robots", "env.dtype=float64"),
+    "density per world": ("env=random_density",),
+    "moving density": ("env=moving_density",),
+    "age density": ("env=age_density",),
+    "long duration": ("env=long_duration", "env.horizon=0"),
+    "one robot": ("env.n_agents=1",),
+}
+
+
+def only_run(tmp_path) -> Path:
+    (summary,) = tmp_path.glob("runs/*/*/summary.json")
+    return summary.parent
+
+
+@pytest.mark.parametrize("overrides", VARIANTS.values(), ids=VARIANTS.keys())
+def test_tiny_run(program, tmp_path, overrides):
+    code, output = program(train.main, *TINY, *overrides)
+    assert code == 0, output
+    folder = only_run(tmp_path)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["frames"] == 64
+    assert set(summary["train"]["violations"]) == {"depleted", "stranded", "overcharged", "collision"}
+    filter_keys = {"intervention_rate", "mean_correction", "fallback_rate", "infeasible", "outside", "max_residual"}
+    assert filter_keys <= set(summary["filter"])
+    eval_keys = {
+        "coverage_cost",
+        "episode_reward",
+        "violations",
+        "charges_per_robot",
+        "min_energy_margin",
+        "min_distance_margin",
+    }
+    assert eval_keys <= set(summary["eval"])
+    top = {"config_hash", "git_hash", "versions", "seed", "frames", "episodes", "wall_time_s", "frames_per_second"}
+    assert top <= set(summary)
+    assert math.isfinite(summary["eval"]["coverage_cost"])
+    assert folder.name == f"{summary['config_hash']}_seed0"
+
+
+def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
+    code, output = program(train.main, "experiment=smoke", "seed=3")
+    assert code == 0, output
+    folder = only_run(tmp_path)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["seed"] == 3
+    assert summary["episodes"] >= 8
+    events = EventAccumulator(str(folder)).Reload()
+    tags = set(events.Tags()["scalars"])
+    assert {tag.split("/")[0] for tag in tags} == {"train", "loss", "filter", "eval", "time"}
+    assert {"train/return", "train/coverage_cost", "train/violations_collision", "loss/actor", "loss/value"} <= tags
+    assert events.Scalars("train/coverage_cost")[-1].step == summary["frames"]  # the x-axis is frames
+    with Image.open(folder / "figures" / "training.png") as picture:
+        assert picture.size[0] > 400
+    assert len(list((folder / "checkpoints").glob("*.pt"))) >= 2
+    assert not list((folder / "checkpoints").glob("*.tmp"))
+
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    code, output = program(train.main, "experiment=smoke", "seed=3")
+    assert code == 0
+    assert "finished run" in output
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+    code, output = program(evaluate.main, f"run={folder}", "steps=30", "num_envs=3")
+    assert code == 0, output
+    target = folder / "eval" / "default_30_0"
+    result = json.loads((target / "eval.json").read_text())
+    assert result["robot_steps"] == 3 * 3 * 30
+    assert "intervention_rate" in result["filter"]
+    for name in ("surveying_1.png", "charging.png", "surveying_2.png", "battery.png", "world.gif"):
+        with Image.open(target / name) as picture:
+            assert picture.size[0] > 300
+
+    files = set(folder.rglob("*"))
+    code, output = program(evaluate.main, f"run={folder}", "env.n_agents=5")
+    assert code == 1
+    assert "n_agents is 3 there, 5 here" in output
+    assert "Traceback" not in output
+    assert set(folder.rglob("*")) == files
+
+
+def test_same_seed_same_result(program, tmp_path):
+    results = []
+    for name in ("a", "b"):
+        code, output = program(train.main, "experiment=smoke", "collector.total_frames=256", f"hydra.run.dir={name}")
+        assert code == 0, output
+        summary = json.loads((tmp_path / name / "summary.json").read_text())
+        results.append((summary["eval"], summary["filter"], summary["train"]))
+    assert results[0] == results[1]
+    code, _ = program(train.main, "experiment=smoke", "collector.total_frames=256", "hydra.run.dir=c", "seed=1")
+    other = json.loads((tmp_path / "c" / "summary.json").read_text())
+    assert other["eval"] != results[0][0]
+
+
+def test_controller_evaluation_writes_its_own_folder(program, tmp_path):
+    code, output = program(evaluate.main, "controller=lloyd", "steps=10", "num_envs=2", "pictures=false")
+    assert code == 0, output
+    (result,) = tmp_path.glob("runs/controllers/lloyd_stacked_default_10_0_*/eval.json")
+    assert json.loads(result.read_text())["robot_steps"] == 60
+
+
+def test_a_bad_job_of_a_multirun_leaves_the_others_alone(program, tmp_path):
+    code, output = program(train.main, "-m", *TINY, "env.n_agents=2,0")
+    assert code == 1
+    assert "env.n_agents=0" in output
+    assert len(list(tmp_path.glob("runs/*/*/summary.json"))) == 1
