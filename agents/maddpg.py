@@ -55,7 +55,7 @@ class MADDPGLoss(DDPGLoss):
         others = replay_action if self.agent.gradient == "per_agent" else action
         td.set(JOINT_ACTION, joint_action(action, others, centralized=self.agent.algorithm == "maddpg"))
         with self._cached_detached_value_params.to_module(self.value_network, preserve_module_state=False):
-            td = self.value_network[-1](td)
+            td = self.value_network[-1](td)  # pyright: ignore[reportIndexIssue]  the critic alone: the joint action is there
         loss = -td[STATE_ACTION_VALUE].squeeze(-1)
         if self.agent.correction_penalty:
             loss = loss + self.agent.correction_penalty * (td[keys.CORRECTION] / self.max_speed).square().squeeze(-1)

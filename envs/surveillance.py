@@ -52,8 +52,6 @@ class SurveillanceEnv(EnvBase):
         ValueError: if ``num_envs < 1``.
     """
 
-    batch_locked = True
-
     def __init__(
         self,
         config: SurveillanceConfig | None = None,
@@ -286,13 +284,15 @@ class SurveillanceEnv(EnvBase):
 
     def _observe(self, weights: Tensor) -> Tensor:
         c, state = self.config, self._state
-        position, length = state["position"], c.length_scale
+        position: Tensor = state["position"]
+        length = c.length_scale
+        slot_position: Tensor = self.slots[state["slot"]]
         share = (state["energy"] - c.energy_min) / (c.energy_max - c.energy_min)
         relative = position[:, self._others] - position.unsqueeze(-2)  # (B, N, N-1, d)
         fields = [
             (position - self.bounds.mean(-1)) / length,
             share.unsqueeze(-1),
-            (self.slots[state["slot"]] - position) / length,
+            (slot_position - position) / length,
             (self.stations - position.unsqueeze(-2)).flatten(-2) / length,
             relative.flatten(-2) / length,
             share[:, self._others],

@@ -12,8 +12,8 @@ Two solvers, the same guarantees:
 
 * "exact", n ≤ 3: enumeration of active sets (safety/qp_exact.py); `project_halfspaces_ball` is its hot path.
 * "qpth", any n: the batched interior-point method of Amos & Kolter, "OptNet" (ICML 2017). Stock qpth is silently wrong
-  on a quarter of barrier QPs, whose bounds span orders of magnitude and spoil its starting point; the guard scales the
-  problem, caps slack bounds, polishes the active set, and checks against the problem as it was given.
+  on up to a third of barrier QPs, mostly for a fault in its step length; the guard mends that, scales the problem, caps
+  slack bounds, polishes the active set, and checks against the problem as it was given.
 
 Whatever the solver, the KKT residual of the given problem, recomputed in float64, decides SOLVED; see `KKT_TOL`. All
 arithmetic is float64 inside, so float32 results are correctly rounded solutions for the float32 data (the residual is
@@ -56,8 +56,7 @@ KKT_TOL = {torch.float32: 1e-6, torch.float64: 1e-7}
 _SOLVERS = ("exact", "qpth")
 _CAP = 1.5  # slack rows end up at this multiple of the most they can need, given the bound on |u|
 _BOUND_FACTORS = (1.0, 1.0, 10.0, 2.0, 100.0, 0.5, 1000.0, 3.0)
-"""Successive bounds on |u| over the a-priori one: mostly larger, but interior-point failures also depend on luck with
-the start. 1 comes twice because one sample that breaks down stops qpth for its whole batch."""
+"""Bounds on |u| to try, over the a-priori one. 1 comes twice: one sample that breaks down stops qpth for its whole batch."""
 _QPTH = {"eps": 1e-13, "verbose": -1, "notImprovedLim": 5, "maxIter": 60}
 _PHASE1_WEIGHT = 1e-8  # of ‖u‖² against t²
 _PHASE1_GAP = 1e-6  # least violation that the infeasibility certificate must show, in units of the bound on |u|
@@ -242,8 +241,7 @@ class _SolveQP(torch.autograd.Function):
             g = metric.down(g)
             dz = -metric.up(basis.project(g))
             dy = torch.linalg.solve_triangular(basis.R, -(basis.axes @ g[..., None]), upper=True)[..., 0]
-            dlam = torch.zeros_like(metric.scale).scatter_add(1, basis.picks, dy) / metric.scale
-            dlam = dlam[:, :-1] / size
+            dlam = (torch.zeros_like(metric.scale).scatter_add(1, basis.picks, dy) / metric.scale)[:, :-1] / size
             dp[index] = dz.to(dp.dtype)
             dG[index] = (lam[..., None] * dz[:, None] + dlam[..., None] * u[:, None]).to(dG.dtype)
             dh[index] = -dlam.to(dh.dtype)
@@ -259,13 +257,9 @@ def _step_to_boundary(v: Tensor, dv: Tensor) -> Tensor:
 
 
 def _interior_point(Q: Tensor, p: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Run qpth, its step length mended, without a word on stdout: u (B, n), multipliers (B, m), slacks (B, m).
-
-    Zeros (slacks: ones) where it broke down.
-    """
-    parts = []
+    """Run qpth, mended and quiet: u (B, n), multipliers (B, m), slacks (B, m); 0, 0, 1 where it broke down."""
+    parts, none = [], Q.new_empty(0)
     step = max(1, CHUNK_BYTES // (8 * 8 * G.shape[1] ** 2))
-    none = Q.new_empty(0)
     for q, c, rows, b in zip(Q.split(step), p.split(step), G.split(step), h.split(step), strict=True):
         pdipm.factor_kkt_eye = None  # a global that qpth reuses by shape only, whatever the device
         stock, pdipm.get_step = pdipm.get_step, _step_to_boundary
@@ -336,7 +330,6 @@ def _solve_qpth(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, tol: float) -> Raw:
     excess = ((rows * t[:, None]).sum(-1) - bound).amax(-1)  # ‖w - t‖ ≥ excess, and rarely far more
     reach = 2 * torch.maximum(norm(t), excess)
     reach = torch.where(reach > 0, reach, 1.0)
-    sum_abs = rows.abs().sum(-1)
     raw = Raw.blank(metric.up(t), h.shape[1])
     usable, zero = ~impossible & ~metric.bad, torch.zeros_like(reach)
     # Where no row is violated the unconstrained minimiser is the answer, for Q = I bit for bit.
@@ -349,7 +342,7 @@ def _solve_qpth(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, tol: float) -> Raw:
         if not len(todo):
             break
         s = (reach[todo] * factor)[:, None]
-        b = torch.where(idle[todo], 1.0, torch.minimum(bound[todo] / s, _CAP * sum_abs[todo]))
+        b = torch.where(idle[todo], 1.0, torch.minimum(bound[todo] / s, _CAP * rows[todo].abs().sum(-1)))
         x, z, slack = _interior_point(eye.expand(len(todo), -1, -1).contiguous(), -t[todo] / s, rows[todo], b)
         for w, dual in ((x * s, z * s), _polish(t[todo], rows[todo], bound[todo], z, slack)):
             u, lam = metric.up(w, todo), dual / metric.scale[todo]

@@ -543,7 +543,7 @@ def test_observation_field_by_field(family, d, horizon):
     share = (energy - 0.2) / 1.0
     stations, slots = np.array(env.config.station_positions), np.array(env.config.slot_positions)
     points = env.density.points.numpy()
-    params = td[keys.DENSITY][b].numpy() if keys.DENSITY in td.keys() else None
+    params = td[keys.DENSITY][b].numpy() if env.density.n_params else None
     weights = env.density.weights(torch.zeros(1, 0) if params is None else td[keys.DENSITY][b : b + 1])
     weights = weights.reshape(-1).numpy()
     owner = np.array([min(range(4), key=lambda i, q=q: math.dist(position[i], q)) for q in points])

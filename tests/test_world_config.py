@@ -13,7 +13,7 @@ NAN, INF = float("nan"), float("inf")
 RANGES = {
     "n_agents": (1, 64, [0, -3, 65], [1]),
     "dt": (0, 10, [0, -0.1, 10.5, NAN, INF], [1e-3]),
-    "max_speed": (0, 100, [0.0, -1.0, 100.1, NAN, INF], [1e-3]),
+    "max_speed": (0, 100, [0.0, -1.0, 100.1, NAN, INF], [0.01]),
     "slot_radius": (0, 10, [-1e-9, 10.1, NAN], [0, 10]),
     "energy_max": (0, 1e6, [0, -1.0, 1.1e6, INF], [1e6]),
     "energy_min": (0, 1.0, [-0.1, 1.1, NAN], [0]),
@@ -70,12 +70,8 @@ def test_numbers_out_of_range_are_refused(name, value):
 
 
 @pytest.mark.parametrize(("name", "value"), [(n, v) for n, row in RANGES.items() for v in row[3]])
-def test_numbers_at_the_edge_of_their_range_are_accepted_by_the_range_check(name, value):
-    """A combination with the other fields may still be refused, but then the message is not about the range."""
-    try:
-        assert getattr(SurveillanceConfig(**{name: value}), name) == value
-    except ValueError as error:
-        assert "out of range" not in str(error)
+def test_numbers_at_the_edge_of_their_range_are_accepted(name, value):
+    assert getattr(SurveillanceConfig(**{name: value}), name) == value
 
 
 @pytest.mark.parametrize("value", ["fast", None, [0.2]])

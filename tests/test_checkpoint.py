@@ -1,0 +1,133 @@
+"""Checkpoints: atomic, read without code execution, refused with a reason."""
+
+import os
+
+import pytest
+import torch
+
+from agents.checkpoint import CheckpointError, check_world, latest_checkpoint, load_checkpoint, save_checkpoint
+
+torch.set_num_threads(1)
+
+
+def content(seed=0):
+    return {
+        "actor": {"weight": torch.randn(3, 4, generator=torch.Generator().manual_seed(seed))},
+        "frames": 17,
+        "names": ["a", "b"],
+        "rate": 0.5,
+    }
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_is_saved_comes_back(tmp_path):
+    path = tmp_path / "run" / "checkpoints" / "frames_000017.pt"
+    assert save_checkpoint(path, content()) == path
+    assert names(path.parent) == ["frames_000017.pt"]  # no temporary file left
+    loaded = load_checkpoint(path)
+    assert torch.equal(loaded["actor"]["weight"], content()["actor"]["weight"])
+    assert (loaded["frames"], loaded["names"], loaded["rate"]) == (17, ["a", "b"], 0.5)
+
+
+def test_saving_replaces_the_file_as_a_whole(tmp_path):
+    path = save_checkpoint(tmp_path / "a.pt", content(0))
+    save_checkpoint(path, content(1))
+    assert torch.equal(load_checkpoint(path)["actor"]["weight"], content(1)["actor"]["weight"])
+    assert names(tmp_path) == ["a.pt"]
+
+
+def test_failure_while_saving_leaves_the_old_file_alone(tmp_path):
+    path = save_checkpoint(tmp_path / "a.pt", content(0))
+    before = path.read_bytes()
+    with pytest.raises((AttributeError, TypeError, RuntimeError), match=r"pickle|local"):
+        save_checkpoint(path, {**content(1), "function": lambda: None})
+    assert path.read_bytes() == before
+    with pytest.raises((AttributeError, TypeError, RuntimeError), match=r"pickle|local"):
+        save_checkpoint(tmp_path / "b.pt", {"function": lambda: None})
+    assert not (tmp_path / "b.pt").exists()
+
+
+def test_missing_file(tmp_path):
+    path = tmp_path / "none.pt"
+    with pytest.raises(CheckpointError, match=rf"{path} does not exist: give the folder of a run"):
+        load_checkpoint(path)
+
+
+class Foreign:
+    """Pickled by reference: weights_only must not run it."""
+
+
+def truncate(path):
+    save_checkpoint(path, content())
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def damage(path):
+    save_checkpoint(path, content())
+    path.write_bytes(b"\0" * path.stat().st_size)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        truncate,
+        damage,
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_text("no checkpoint at all"),
+        lambda path: torch.save({"format": 1, "thing": Foreign()}, path),
+    ],
+    ids=["truncated", "zeros", "empty", "text", "foreign object"],
+)
+def test_unreadable_file(tmp_path, make):
+    path = tmp_path / "bad.pt"
+    make(path)
+    with pytest.raises(
+        CheckpointError, match=rf"{path} cannot be read .*damaged or not a checkpoint.*Use another file"
+    ):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("foreign", [{"format": 2}, {"weights": 1}, [1, 2], torch.zeros(3)], ids=str)
+def test_other_format(tmp_path, foreign):
+    path = tmp_path / "other.pt"
+    torch.save(foreign, path)
+    found = foreign.get("format") if isinstance(foreign, dict) else None
+    with pytest.raises(CheckpointError, match=rf"{path} has format {found}, this version reads format 1: train again"):
+        load_checkpoint(path)
+
+
+def test_error_is_a_value_error():
+    assert issubclass(CheckpointError, ValueError)  # so that the command line shows it as one clear message
+
+
+def test_latest_is_the_newest_by_time(tmp_path):
+    folder = tmp_path / "checkpoints"
+    for k, name in enumerate(("frames_2.pt", "frames_3.pt", "frames_1.pt")):
+        os.utime(save_checkpoint(folder / name, content()), (1000 + k, 1000 + k))
+    (folder / "frames_9.tmp").write_bytes(b"")
+    assert latest_checkpoint(tmp_path) == folder / "frames_1.pt"
+    os.utime(folder / "frames_2.pt", (1002, 1002))
+    assert latest_checkpoint(tmp_path) == folder / "frames_2.pt"  # the same time: the later name
+
+
+def test_run_without_checkpoint(tmp_path):
+    with pytest.raises(CheckpointError, match=rf"run={tmp_path} has no checkpoint"):
+        latest_checkpoint(tmp_path)
+
+
+def test_world_of_another_size(tmp_path):
+    path, world = tmp_path / "a.pt", {"n_agents": 3, "dimension": 2, "n_observation": 18}
+    check_world(path, dict(world), world)
+    with pytest.raises(CheckpointError) as caught:
+        check_world(path, world | {"n_agents": 5, "n_observation": 28}, world)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "n_agents is 5 there, 3 here" in message
+    assert "n_observation is 28 there, 18 here" in message
+    assert "dimension" not in message
+    assert "leave env out" in message
+    with pytest.raises(CheckpointError, match="n_agents is None there, 3 here"):
+        check_world(path, {"dimension": 2, "n_observation": 18}, world)

@@ -1,0 +1,410 @@
+"""The MADDPG update against networks and formulas written out here, robot by robot, on batches from the environment."""
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from agents import AgentConfig
+from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
+from agents.networks import make_actor, make_critic, make_policies
+from agents.pipeline import make_buffer, to_transitions
+from envs import SurveillanceConfig, SurveillanceEnv, keys
+from safety import SafetyConfig, SafetyFilter
+
+torch.set_num_threads(1)
+N, D = 3, 2
+SMALL = {"actor_cells": [8], "critic_cells": [8, 6]}
+NEXT_TERMINATED = ("next", *keys.TERMINATED)
+NEXT_DONE = ("next", *keys.DONE)
+
+
+class Setup:
+    """World, networks, losses and one batch of 80 transitions, all in float64."""
+
+    def __init__(self, *, safety=None, speed_up=1.0, **agent):
+        torch.manual_seed(0)
+        self.world = SurveillanceConfig(dtype="float64", reset_reserve=0.0)
+        self.agent = AgentConfig(**(SMALL | agent))
+        self.safety = SafetyConfig(**(safety or {}))
+        env = SurveillanceEnv(self.world, 8, seed=0)
+        self.actor = make_actor(env.n_observation, self.world, self.agent)
+        self.critic = make_critic(env.n_observation, self.world, self.agent)
+        _, explore = make_policies(self.actor, self.world, self.safety, self.agent, 0, torch.device("cpu"))
+        with torch.no_grad():
+            self.actor.module.net.params["2"]["weight"].mul_(speed_up)
+            self.batch = to_transitions(env.rollout(10, explore, break_when_any_done=False))
+        assert self.batch.shape == (80,)
+        self.loss, self.updater = make_loss(self.actor, self.critic, self.agent, self.safety, self.world)
+        with torch.no_grad():  # let online and target networks differ
+            for params in (self.loss.target_actor_network_params, self.loss.target_value_network_params):
+                for p in params.values(True, True):
+                    p.add_(
+                        0.1 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel()), dtype=p.dtype)
+                    )
+
+    def networks(self, which):
+        """``(actor layers, critic layers)``, lists of (weight, bias), of the "online" or the "target" networks."""
+        prefix = "" if which == "online" else "target_"
+        found = []
+        for name, child in (("actor", "0"), ("value", "1")):
+            params = getattr(self.loss, f"{prefix}{name}_network_params")["module", child, "module", "net", "params"]
+            numbers = sorted(set(params.keys()), key=int)
+            found.append([(params[k]["weight"], params[k]["bias"]) for k in numbers])
+        return found
+
+    def act(self, layers, observation):
+        """Actions of all robots by hand, ``(B, N, d)``."""
+        actions = []
+        for i in range(N):
+            z = mlp(layers, i, observation[:, i])
+            norm = z.norm(dim=-1, keepdim=True)
+            actions.append(self.world.max_speed * norm.tanh() * z / norm)
+        return torch.stack(actions, 1)
+
+    def value(self, layers, i, observation, action):
+        """``Q_i`` by hand, ``(B,)``."""
+        action = action / self.world.max_speed
+        if self.agent.algorithm == "ddpg":
+            return mlp(layers, i, torch.cat([observation[:, i], action[:, i]], -1)).squeeze(-1)
+        return mlp(layers, i, torch.cat([observation.flatten(1), action.flatten(1)], -1)).squeeze(-1)
+
+    def filtered(self, nominal, td):
+        """Filter on the states of ``td``: action and correction ``(B, N)``."""
+        state = (td[keys.POSITION], td[keys.ENERGY].squeeze(-1), td[keys.SLOT].squeeze(-1))
+        action, _, correction, *_ = SafetyFilter(self.safety, self.world).filter(nominal, *state)
+        return action, correction.squeeze(-1)
+
+    def gradients(self, loss):
+        """Gradient of the actors' parameters, layer by layer; each ``(N, ...)``."""
+        for p in self.loss.parameters():
+            p.grad = None
+        loss.backward(retain_graph=True)
+        params = self.loss.actor_network_params
+        return [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in params.values(True, True)]
+
+
+def mlp(layers, i, x):
+    for k, (weight, bias) in enumerate(layers):
+        x = x @ weight[i].T + bias[i]
+        x = x.relu() if k + 1 < len(layers) else x
+    return x
+
+
+def leaves(layers):
+    return [(w.detach().clone().requires_grad_(), b.detach().clone().requires_grad_()) for w, b in layers]
+
+
+# ---- actor -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("algorithm", ["maddpg", "ddpg"])
+def test_actor_gradient_is_the_papers(algorithm):
+    s = Setup(algorithm=algorithm)
+    actor, critic = s.networks("online")
+    actor, observation, replay = leaves(actor), s.batch[keys.OBSERVATION], s.batch[keys.ACTION]
+    total = 0
+    for i in range(N):
+        action = replay.clone()
+        action[:, i] = s.act(actor, observation)[:, i]
+        total = total - s.value(critic, i, observation, action).mean()
+    total.backward()
+    loss = s.loss(s.batch)["loss_actor"]
+    assert loss.shape == (80, N)
+    torch.testing.assert_close(loss.mean(0).sum(), total)
+    expected = {tuple(p.shape): p.grad for layer in actor for p in layer}
+    for got in s.gradients(loss.mean(0).sum()):
+        assert got.abs().max() > 0
+        torch.testing.assert_close(got, expected[tuple(got.shape)])
+
+
+@pytest.mark.parametrize(("gradient", "crosses"), [("per_agent", False), ("shared", True)])
+def test_critic_of_another_robot_reaches_an_actor_only_if_asked(gradient, crosses):
+    s = Setup(gradient=gradient)
+    loss = s.loss(s.batch)["loss_actor"]
+    for j in range(N):
+        for gradient_of_j in s.gradients(loss[:, j].mean()):
+            per_robot = gradient_of_j.flatten(1).abs().sum(1)
+            assert per_robot[j] > 0
+            for i in set(range(N)) - {j}:
+                assert (per_robot[i] > 0) == crosses
+
+
+def test_shared_gradient_recomputes_all_actions():
+    s = Setup(gradient="shared")
+    actor, critic = s.networks("online")
+    action = s.act(actor, s.batch[keys.OBSERVATION])
+    expected = torch.stack([-s.value(critic, i, s.batch[keys.OBSERVATION], action) for i in range(N)], 1)
+    torch.testing.assert_close(s.loss(s.batch)["loss_actor"], expected)
+
+
+def test_losses_reach_their_own_networks_only():
+    s = Setup()
+    for name, own, other in (
+        ("loss_actor", s.loss.actor_network_params, s.loss.value_network_params),
+        ("loss_value", s.loss.value_network_params, s.loss.actor_network_params),
+    ):
+        s.gradients(s.loss(s.batch)[name].mean(0).sum())
+        assert all(p.grad is not None and p.grad.abs().max() > 0 for p in own.values(True, True))
+        assert all(p.grad is None or (p.grad == 0).all() for p in other.values(True, True))
+    for params in (s.loss.target_actor_network_params, s.loss.target_value_network_params):
+        assert not any(p.requires_grad for p in params.values(True, True))
+
+
+# ---- critic ----------------------------------------------------------------------------------------------------------
+def target_by_hand(s, terminated, *, safe=False):
+    actor, critic = s.networks("target")
+    following = s.batch["next"]
+    observation = following[keys.OBSERVATION]
+    action = s.act(actor, observation)
+    action = s.filtered(action, following)[0] if safe else action
+    future = torch.stack([s.value(critic, i, observation, action) for i in range(N)], 1)
+    return following[keys.REWARD].squeeze(-1) + s.agent.gamma * future * (1 - terminated.double())
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "ddpg"])
+def test_critic_target_and_loss(algorithm):
+    s = Setup(algorithm=algorithm, gamma=0.9)
+    terminated = torch.zeros(80, N, 1, dtype=torch.bool)
+    terminated[::3] = True
+    truncated = torch.zeros(80, N, 1, dtype=torch.bool)
+    truncated[1::3] = True
+    s.batch[NEXT_TERMINATED], s.batch[NEXT_DONE] = terminated, terminated | truncated
+    expected = target_by_hand(s, terminated.squeeze(-1))
+    out = s.loss(s.batch)
+    torch.testing.assert_close(out["target_value"], expected)
+    assert torch.equal(out["target_value"][::3], s.batch["next"][keys.REWARD].squeeze(-1)[::3])
+    _, critic = s.networks("online")
+    observation, action = s.batch[keys.OBSERVATION], s.batch[keys.ACTION]
+    value = torch.stack([s.value(critic, i, observation, action) for i in range(N)], 1)
+    torch.testing.assert_close(out["pred_value"], value)
+    torch.testing.assert_close(out["loss_value"], (value - expected).square())
+
+
+def test_time_limit_does_not_cut_the_bootstrap():
+    s = Setup()
+    s.batch[NEXT_TERMINATED] = torch.zeros(80, N, 1, dtype=torch.bool)
+    s.batch[NEXT_DONE] = torch.zeros(80, N, 1, dtype=torch.bool)
+    running = s.loss(s.batch)["target_value"]
+    s.batch[NEXT_DONE] = torch.ones(80, N, 1, dtype=torch.bool)
+    assert torch.equal(s.loss(s.batch)["target_value"], running)
+    s.batch[NEXT_TERMINATED] = torch.ones(80, N, 1, dtype=torch.bool)
+    assert not torch.allclose(s.loss(s.batch)["target_value"], running)
+
+
+def nudge(params):
+    with torch.no_grad():
+        for p in params.values(True, True):
+            p.add_(0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "moves"),
+    [
+        ("actor_network_params", False),
+        ("value_network_params", False),
+        ("target_actor_network_params", True),
+        ("target_value_network_params", True),
+    ],
+)
+def test_target_value_comes_from_the_target_networks(name, moves):
+    s = Setup()
+    before = s.loss(s.batch)["target_value"]
+    nudge(getattr(s.loss, name))
+    assert torch.allclose(s.loss(s.batch)["target_value"], before) != moves
+
+
+# ---- update ----------------------------------------------------------------------------------------------------------
+def test_targets_follow_softly():
+    s = Setup(tau=0.2)
+    optimizers = make_optimizers(s.loss, s.agent)
+    pairs = [
+        (getattr(s.loss, f"{name}_network_params"), getattr(s.loss, f"target_{name}_network_params"))
+        for name in ("actor", "value")
+    ]
+    online_before = [online.clone() for online, _ in pairs]
+    before = [target.clone() for _, target in pairs]
+    metrics = update_step(s.batch, s.loss, optimizers, s.updater, s.agent)
+    for (online, target), old, start in zip(pairs, before, online_before, strict=True):
+        for key, value in target.items(True, True):
+            torch.testing.assert_close(value, 0.8 * old[key] + 0.2 * online[key].detach())
+            assert (online[key] != start[key]).any()  # both networks were updated
+    assert set(metrics.keys()) >= {"actor", "value", "q_value", "target", "grad_norm_actor", "grad_norm_value"}
+    assert all(value.isfinite() and not value.requires_grad for value in metrics.values())
+
+
+def test_update_moves_each_network_by_its_own_rate():
+    # Adam's first step is the learning rate, whatever the gradient
+    s = Setup(actor_lr=1e-3, critic_lr=1e-2)
+    groups = {name: getattr(s.loss, f"{name}_network_params") for name in ("actor", "value")}
+    start = {name: params.clone() for name, params in groups.items()}
+    update_step(s.batch, s.loss, make_optimizers(s.loss, s.agent), s.updater, s.agent)
+    for name, rate in (("actor", 1e-3), ("value", 1e-2)):
+        moved = [(p - start[name][key]).abs().max().item() for key, p in groups[name].items(True, True)]
+        assert moved == pytest.approx([rate] * len(moved), rel=1e-2)
+
+
+def test_critics_fit_a_fixed_batch():
+    s = Setup(gamma=0.5, critic_lr=3e-3)
+    optimizers = make_optimizers(s.loss, s.agent)
+    history = [update_step(s.batch, s.loss, optimizers, s.updater, s.agent)["value"] for _ in range(50)]
+    assert history[-1] < 0.2 * history[0]
+
+
+def test_actors_climb_fixed_critics():
+    s = Setup(critic_lr=1e-12, actor_lr=3e-3)
+    optimizers = make_optimizers(s.loss, s.agent)
+    history = [update_step(s.batch, s.loss, optimizers, s.updater, s.agent)["actor"] for _ in range(20)]
+    assert all(later < earlier for earlier, later in itertools.pairwise(history))
+
+
+def test_gradient_norm_is_clipped_on_request():
+    metrics = {}
+    for limit in (0.0, 1e-3):
+        s = Setup(max_grad_norm=limit)
+        metrics[limit] = update_step(s.batch, s.loss, make_optimizers(s.loss, s.agent), s.updater, s.agent)
+        norm = torch.stack([p.grad.norm() for p in s.loss.value_network_params.values(True, True)]).norm()
+        reported = metrics[limit]["grad_norm_value"]
+        torch.testing.assert_close(norm, torch.tensor(limit).double() if limit else reported, rtol=1e-3, atol=1e-9)
+    torch.testing.assert_close(metrics[0.0]["grad_norm_value"], metrics[1e-3]["grad_norm_value"])
+
+
+def test_minibatches_of_their_own():
+    loss = torch.randn(N * 5, N, generator=torch.Generator().manual_seed(0))
+    own = sum(loss[5 * i : 5 * (i + 1), i].mean() for i in range(N))
+    torch.testing.assert_close(reduce_robots(loss, AgentConfig(minibatch="per_agent")), own)
+    torch.testing.assert_close(reduce_robots(loss, AgentConfig()), sum(loss[:, i].mean() for i in range(N)))
+
+
+def test_update_with_minibatches_of_their_own():
+    s = Setup(minibatch="per_agent", tau=1e-9, gamma=0.5)
+    batch = s.batch[: 3 * 20]
+    s.loss.zero_grad()
+    alone = [s.gradients(s.loss(batch[20 * i : 20 * (i + 1)])["loss_actor"][:, i].mean()) for i in range(N)]
+    got = s.gradients(reduce_robots(s.loss(batch)["loss_actor"], s.agent))
+    for layer, gradient in enumerate(got):
+        torch.testing.assert_close(gradient, torch.stack([alone[i][layer][i] for i in range(N)]))
+
+
+# ---- the filter inside the loss --------------------------------------------------------------------------------------
+def fast(**safety):
+    """Actors at nearly full speed on states with little energy to spare: the filter corrects some of them."""
+    return Setup(safety=safety, speed_up=60.0)
+
+
+def test_filter_in_the_loss_filters_policy_and_target():
+    s = fast(in_loss=True)
+    actor, critic = s.networks("online")
+    nominal = s.act(actor, s.batch[keys.OBSERVATION]).detach()
+    safe, correction = s.filtered(nominal, s.batch)
+    assert (correction > 1e-3).sum() >= 5
+    assert (correction == 0).sum() >= 5
+    out = s.loss(s.batch)
+    for i in range(N):
+        action = s.batch[keys.ACTION].clone()
+        action[:, i] = safe[:, i]
+        expected = -s.value(critic, i, s.batch[keys.OBSERVATION], action)
+        torch.testing.assert_close(out["loss_actor"][:, i], expected)
+    terminated = s.batch[NEXT_TERMINATED].squeeze(-1)
+    torch.testing.assert_close(out["target_value"], target_by_hand(s, terminated, safe=True))
+    assert not torch.allclose(out["target_value"], target_by_hand(s, terminated))
+
+
+def test_gradient_flows_through_the_filter():
+    inside, outside = fast(in_loss=True), fast()
+    nominal = inside.act(inside.networks("online")[0], inside.batch[keys.OBSERVATION]).detach()
+    _, correction = inside.filtered(nominal, inside.batch)
+    for i in range(N):
+        free, corrected = correction[:, i] == 0, correction[:, i] > 1e-3
+        assert free.any()
+        for rows, same in ((free, True), (corrected, False)):
+            if not rows.any():
+                continue
+            a, b = (s.gradients(s.loss(s.batch)["loss_actor"][rows, i].sum()) for s in (inside, outside))
+            equal = [torch.allclose(x[i], y[i], rtol=1e-6, atol=1e-12) for x, y in zip(a, b, strict=True)]
+            assert all(equal) == same
+            assert all(x.isfinite().all() for x in a)
+            assert not same or a[0][i].abs().max() > 0
+    assert (correction > 1e-3).any(0).sum() >= 2
+
+
+def test_gradient_in_the_loss_matches_finite_differences():
+    s = fast(in_loss=True)
+    weight = s.loss.actor_network_params["module", "0", "module", "net", "params", "2", "bias"]
+    objective = s.loss(s.batch)["loss_actor"].mean(0).sum()
+    s.gradients(objective)
+    analytic, step = weight.grad.clone(), 1e-6
+    for index in ((0, 0), (1, 1), (2, 0)):
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                weight[index] += sign * step
+                values.append(s.loss(s.batch)["loss_actor"].mean(0).sum())
+                weight[index] -= sign * step
+        assert analytic[index].item() == pytest.approx((values[0] - values[1]).item() / (2 * step), rel=2e-3, abs=1e-6)
+
+
+def test_joint_filter_in_the_loss_keeps_neighbours_detached():
+    s = fast(in_loss=True, split="joint")
+    s.batch = s.batch[::8]
+    loss = s.loss(s.batch)["loss_actor"]
+    assert loss.isfinite().all()
+    for j in range(N):
+        for gradient in s.gradients(loss[:, j].mean()):
+            per_robot = gradient.flatten(1).abs().sum(1)
+            assert per_robot[j] > 0
+            assert all(per_robot[i] == 0 for i in range(N) if i != j)
+
+
+def test_correction_penalty():
+    plain, penal = fast(in_loss=True), Setup(safety={"in_loss": True}, speed_up=60.0, correction_penalty=0.7)
+    nominal = plain.act(plain.networks("online")[0], plain.batch[keys.OBSERVATION]).detach()
+    _, correction = plain.filtered(nominal, plain.batch)
+    extra = penal.loss(penal.batch)["loss_actor"] - plain.loss(plain.batch)["loss_actor"]
+    torch.testing.assert_close(extra, 0.7 * (correction / plain.world.max_speed) ** 2)
+    assert extra.max() > 1e-3
+    a, b = (s.gradients(s.loss(s.batch)["loss_actor"].sum()) for s in (penal, plain))
+    assert not torch.allclose(a[0], b[0])
+    assert all(x.isfinite().all() for x in a)
+
+
+def test_correction_penalty_needs_the_filter_in_the_loss():
+    with pytest.raises(ValueError, match=r"agent\.correction_penalty=0\.5.*safety\.in_loss=true"):
+        Setup(correction_penalty=0.5)
+
+
+# ---- what is stored --------------------------------------------------------------------------------------------------
+def test_transitions_hold_the_executed_action_and_all_the_filter_reads():
+    s = Setup(noise_initial=3.0)
+    assert not torch.allclose(s.batch[keys.ACTION], s.batch[keys.NOMINAL_ACTION])
+    for td in (s.batch, s.batch["next"]):
+        assert all(key in td.keys(True) for key in (keys.OBSERVATION, keys.POSITION, keys.ENERGY, keys.SLOT))
+    moved = s.batch[keys.POSITION] + s.world.dt * s.batch[keys.ACTION]
+    torch.testing.assert_close(moved, s.batch["next"][keys.POSITION])
+
+
+def test_violation_penalty_is_charged_to_the_violator():
+    reward = torch.full((2, 3, N, 1), -1.0)
+    flags = torch.zeros(2, 3, N, 1, dtype=torch.bool)
+    flags[1, 2, 0] = True
+    s = Setup()
+    batch = s.batch[:6].clone().reshape(2, 3)
+    batch["next"][keys.REWARD] = reward
+    for kind in keys.VIOLATION_KINDS:
+        batch["next"][(*keys.VIOLATION, kind)] = flags if kind in ("collision", "stranded") else torch.zeros_like(flags)
+    got = to_transitions(batch, violation_penalty=5.0)["next"][keys.REWARD]
+    expected = torch.full((6, N, 1), -1.0)
+    expected[5, 0] = -11.0
+    assert torch.equal(got, expected)
+    assert (to_transitions(batch)["next"][keys.REWARD] == -1).all()
+
+
+def test_buffer_samples_by_its_own_seed():
+    data = TensorDict({"x": torch.arange(50.0)}, [50])
+    samples = []
+    for seed in (3, 3, 4):
+        torch.manual_seed(seed + len(samples))
+        buffer = make_buffer(100, 16, torch.device("cpu"), seed)
+        buffer.extend(data)
+        samples.append(buffer.sample()["x"])
+    assert torch.equal(samples[0], samples[1])
+    assert not torch.equal(samples[0], samples[2])
