@@ -88,7 +88,7 @@ class SurveillanceConfig:
     age_limit: float = 20.0
     """age: time after which a point's importance stops growing, s, (0, 1e6]."""
     resolution: int = 0
-    """Quadrature points per axis, 2..512; 0 = 20 in 2-D and 10 in 3-D (RMS error of J below 1 %)."""
+    """Quadrature points per axis, 2..512; 0 = 20 in 2-D (RMS error of J below 1 %) and 10 in 3-D (1.5 %)."""
     on_violation: str = "terminate"
     """terminate: the first violation ends the episode. continue: every one counts, a drained robot stands still."""
     reserve: str = "linear"

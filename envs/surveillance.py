@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from envs import keys
 from envs.battery import charge, charging_field, power
 from envs.config import SurveillanceConfig
-from envs.coverage import squared_distances, voronoi_moments
+from envs.coverage import quadrature_points, squared_distances, voronoi_moments
 from envs.density import Density
 from envs.dynamics import integrate, limit_speed
 from envs.homing import exchange_slots, is_certified, reassign_slots, reserve
@@ -74,7 +74,9 @@ class SurveillanceEnv(EnvBase):
         others = torch.arange(config.n_agents).unsqueeze(-1) + torch.arange(1, config.n_agents)
         self._others = (others % config.n_agents).to(device)  # (N, N-1): robots i+1, i+2, ..
         docked = self.slots[: config.n_agents]
-        self.reference_cost = float(self._nearest_squared(docked).mean()) + self.density.cell_moment
+        # J_ref is J under the uniform density whatever the family, so it takes the uniform density's cell moment
+        _, cell_moment = quadrature_points(config.bounds, config.quadrature_resolution)
+        self.reference_cost = float(self._nearest_squared(docked).mean()) + cell_moment
         self.generator = torch.Generator(device=device)
         self._make_specs()
         self._set_seed(seed)
@@ -293,8 +295,8 @@ class SurveillanceEnv(EnvBase):
             (position - self.bounds.mean(-1)) / length,
             share.unsqueeze(-1),
             (slot_position - position) / length,
-            (self.stations - position.unsqueeze(-2)).flatten(-2) / length,
-            relative.flatten(-2) / length,
+            torch.flatten(self.stations - position.unsqueeze(-2), -2) / length,
+            torch.flatten(relative, -2) / length,
             share[:, self._others],
         ]
         if self.density.n_observed:

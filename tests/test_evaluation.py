@@ -90,7 +90,7 @@ def by_hand(rows, world):
     [
         ("random", "none", "terminate", 60),
         ("random", "none", "continue", 60),
-        ("charge_when_low", "paper", "terminate", 150),
+        ("charge_when_low", "paper", "terminate", 110),
     ],
 )
 def test_metrics_are_those_of_the_stored_rollout(name, mode, on_violation, steps):
