@@ -16,12 +16,12 @@ from omegaconf import DictConfig
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents.checkpoint import save_checkpoint
-from agents.evaluation import evaluate_policy
+from agents.checkpoint import keep_newest, save_checkpoint
+from agents.evaluation import evaluate_policy, evaluation_scalars
 from agents.maddpg import make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
-from agents.recorder import TrainingRecorder
+from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
 from conf.schema import Config, config_hash, register, rollout_steps, to_config, world_sizes, write_json
 from conf.versions import git_hash, package_versions
@@ -39,31 +39,35 @@ def main(cfg: DictConfig) -> None:
     config: Config = to_config(cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     if config.resume == "auto" and (folder / "summary.json").is_file():
-        tqdm.write(f"{folder} holds a finished run (summary.json): nothing to do. resume=never trains it anew.")
+        tqdm.write(f"{folder} holds a finished run: nothing to do. resume=never trains it anew.")
         return
-    start, device = time.perf_counter(), pick_device(config.device)
-    torch.manual_seed(config.seed)  # network weights; every other random stream has a generator of its own
-    seeds = np.random.SeedSequence(config.seed).generate_state(4).tolist()
 
-    env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=seeds[0])
+    # ---- build: every random stream has its own seed; the global one draws the initial weights only
+    start, device = time.perf_counter(), pick_device(config.device)
+    env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
+    torch.manual_seed(config.seed)
+    env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed)
     eval_env = SurveillanceEnv(config.env, config.eval.num_envs, device)
     actor = make_actor(env.n_observation, config.env, config.agent).to(device)
     critic = make_critic(env.n_observation, config.env, config.agent).to(device)
-    policy, explore_policy = make_policies(actor, config.env, config.safety, config.agent, seeds[1], device)
+    policy, explore_policy = make_policies(actor, config.env, config.safety, config.agent, noise_seed, device)
     loss_module, target_updater = make_loss(actor, critic, config.agent, config.safety, config.env)
     optimizers = make_optimizers(loss_module, config.agent)
-    per_update = config.env.n_agents if config.agent.minibatch == "per_agent" else 1
-    buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * per_update, device, seeds[2])
+    minibatches = config.env.n_agents if config.agent.minibatch == "per_agent" else 1
+    buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
     collector = make_collector(env, explore_policy, config.collector.frames_per_batch, config.collector.total_frames)
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
     writer = SummaryWriter(str(folder))
-    bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=1.0)
 
-    def evaluate() -> tuple[dict, dict]:
-        eval_env.set_seed(seeds[3])  # the same start states every time
-        steps = config.eval.steps or rollout_steps(config.env.horizon)
-        metrics, statistics, _ = evaluate_policy(eval_env, policy, steps)
-        return metrics, statistics
+    def log(scalars: dict[str, float]) -> None:
+        for tag, value in scalars.items():
+            writer.add_scalar(tag, value, recorder.frames)
+
+    def evaluate() -> dict:
+        eval_env.set_seed(eval_seed)  # the same start states every time
+        metrics, _, _ = evaluate_policy(eval_env, policy, config.eval.steps or rollout_steps(config.env.horizon))
+        log(evaluation_scalars(metrics))
+        return metrics
 
     def checkpoint() -> None:
         content = {
@@ -77,85 +81,58 @@ def main(cfg: DictConfig) -> None:
             "recorder": recorder.state_dict(),
         }
         save_checkpoint(folder / "checkpoints" / f"frames_{recorder.frames:012d}.pt", content)
-        for old in (
-            sorted((folder / "checkpoints").glob("*.pt"))[: -config.checkpoint.keep or None]
-            if config.checkpoint.keep
-            else []
-        ):
-            old.unlink()
+        keep_newest(folder / "checkpoints", config.checkpoint.keep)
 
-    def log(scalars: dict[str, float]) -> None:
-        for tag, value in scalars.items():
-            writer.add_scalar(tag, value, recorder.frames)
-
-    log_interval = max(1, config.collector.total_frames // 200)
-    next_log, next_eval, next_checkpoint = (
-        log_interval,
-        config.eval.interval_frames,
-        config.checkpoint.interval_episodes,
-    )
-    seconds = {"collect": 0.0, "update": 0.0, "eval": 0.0}
-    metrics = None
+    # ---- train: noise, then filter, then execution (explore_policy); the buffer holds executed actions
+    log_due = Every(max(1, config.collector.total_frames // 200))
+    eval_due, checkpoint_due = Every(config.eval.interval_frames), Every(config.checkpoint.interval_episodes)
+    seconds = {"collect": 0.0, "update": 0.0, "evaluate": 0.0}
+    losses: dict[str, torch.Tensor] = {}
+    evaluate()  # the untrained policy
+    bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=1.0)
     mark = time.perf_counter()
     for batch in collector:
         recorder.update(batch)
         buffer.extend(to_transitions(batch, config.train.violation_penalty))
-        seconds["collect"] += time.perf_counter() - mark
-        mark = time.perf_counter()
+        collected = time.perf_counter()
         if recorder.frames >= config.train.warmup_frames:
             for _ in range(config.train.n_updates):
-                metrics = update_step(buffer.sample(), loss_module, optimizers, target_updater, config.agent)
-        seconds["update"] += time.perf_counter() - mark
-        mark = time.perf_counter()
-        if recorder.frames >= next_log:
-            next_log += log_interval
-            scalars = recorder.scalars()
-            log(
-                scalars
-                | ({f"loss/{name}": float(value) for name, value in metrics.items()} if metrics is not None else {})
-            )
-            log({f"time/{name}_s": value for name, value in seconds.items()} | {"train/noise": explore_policy[1].sigma})
-            log({"time/frames_per_second": recorder.frames / (time.perf_counter() - start)})
-            shown = f"return {scalars.get('train/return', float('nan')):.1f} J {scalars['train/coverage_cost']:.3f}"
-            bar.set_postfix_str(f"{shown} violations {sum(recorder.violations.values())}")
+                losses = update_step(buffer.sample(), loss_module, optimizers, target_updater, config.agent)
+        updated = time.perf_counter()
+        if log_due(recorder.frames):
+            scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
+            log(scalars | {f"loss/{name}": float(value) for name, value in losses.items()})
+            log({f"time/{name}_s": value for name, value in seconds.items()})
+            log({"time/frames_per_second": recorder.frames / (updated - start)})
+            bar.set_postfix_str(recorder.progress(scalars))
         bar.update(batch.numel())
-        if config.eval.interval_frames and recorder.frames >= next_eval:
-            next_eval += config.eval.interval_frames
-            result, _ = evaluate()
-            flat = {name: value for name, value in result.items() if isinstance(value, int | float)}
-            flat |= {f"violations_{kind}": count for kind, count in result["violations"].items()}
-            log({f"eval/{name}": value for name, value in flat.items()})
-        if config.checkpoint.interval_episodes and recorder.episodes.episodes >= next_checkpoint:
-            next_checkpoint = recorder.episodes.episodes + config.checkpoint.interval_episodes
+        if eval_due(recorder.frames):
+            evaluate()
+        if checkpoint_due(recorder.episodes.episodes):
             checkpoint()
-        seconds["eval"] += time.perf_counter() - mark
+        seconds["collect"] += collected - mark
+        seconds["update"] += updated - collected
         mark = time.perf_counter()
+        seconds["evaluate"] += mark - updated
     collector.shutdown()
     bar.close()
 
+    # ---- conclude
     checkpoint()
-    result, _ = evaluate()
-    save_training_curve(
-        {name: np.array(rows) for name, rows in recorder.episodes.finished.items()}, folder / "figures/training.png"
-    )
-    wall = time.perf_counter() - start
-    summary = {
+    metrics = evaluate()
+    curves = {name: np.array(values) for name, values in recorder.episodes.finished.items()}
+    save_training_curve(curves, folder / "figures" / "training.png")
+    wall_time = time.perf_counter() - start
+    origin = {
         "config_hash": config_hash(cfg),
         "git_hash": git_hash(),
         "versions": package_versions(),
         "seed": config.seed,
-        "frames": recorder.frames,
-        "episodes": recorder.episodes.episodes,
-        "wall_time_s": wall,
-        "frames_per_second": recorder.frames / wall,
-        "time": seconds,
-        "train": {"violations": recorder.violations},
-        "filter": recorder.filter.summary(),
-        "eval": result,
     }
-    write_json(folder / "summary.json", summary)
+    speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds}
+    write_json(folder / "summary.json", origin | recorder.summary() | speed | {"eval": metrics})
     writer.close()
-    tqdm.write(f"{folder}/summary.json\n{json.dumps(summary['eval'], indent=2)}")
+    tqdm.write(f"{folder}/summary.json\n{json.dumps(metrics, indent=2)}")
 
 
 if __name__ == "__main__":

@@ -32,6 +32,13 @@ def save_checkpoint(path: Path, content: dict) -> Path:
     return path
 
 
+def keep_newest(folder: Path, keep: int) -> None:
+    """Delete all but the ``keep`` newest checkpoints of ``folder``; 0 keeps all."""
+    if keep:
+        for old in sorted(folder.glob("*.pt"))[:-keep]:
+            old.unlink()
+
+
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict:
     """Read a checkpoint.
 

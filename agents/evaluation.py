@@ -71,6 +71,12 @@ def evaluate_policy(
     return metrics, statistics.summary(), None if history is None else history.trajectory()
 
 
+def evaluation_scalars(metrics: dict) -> dict[str, float]:
+    """The numbers of :func:`evaluate_policy`'s metrics by TensorBoard tag."""
+    scalars = {f"eval/{name}": value for name, value in metrics.items() if isinstance(value, int | float)}
+    return scalars | {f"eval/violations_{kind}": count for kind, count in metrics["violations"].items()}
+
+
 def _finite(value: torch.Tensor) -> float | None:
     """None (JSON null) where there is nothing to measure, such as the distance of a single robot."""
     return float(value) if math.isfinite(value) else None

@@ -9,7 +9,7 @@ Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 150
 """
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
@@ -114,7 +114,7 @@ def update_step(
     optimizers: dict[str, torch.optim.Optimizer],
     target_updater: SoftUpdate,
     agent: AgentConfig,
-) -> TensorDict:
+) -> dict[str, Tensor]:
     """One gradient step of all critics and all actors, then the soft update of the targets.
 
     Args:
@@ -128,7 +128,10 @@ def update_step(
         Detached scalars: losses, mean Q and target, gradient norms.
     """
     losses = loss_module(batch)
-    metrics = {"q_value": losses["pred_value"].detach().mean(), "target": losses["target_value"].detach().mean()}
+    metrics: dict[str, Tensor] = {
+        "q_value": losses["pred_value"].detach().mean(),
+        "target": losses["target_value"].detach().mean(),
+    }
     for name, optimizer in optimizers.items():  # only loss_* keys: pred_value carries a graph too
         loss = reduce_robots(losses[name], agent)
         optimizer.zero_grad()
@@ -139,4 +142,4 @@ def update_step(
         optimizer.step()
         metrics[name.removeprefix("loss_")] = loss.detach()
     target_updater.step()
-    return TensorDict(metrics)
+    return metrics

@@ -7,6 +7,21 @@ from envs.metrics import EpisodeTracker
 from safety.statistics import FilterStatistics
 
 
+class Every:
+    """Whether another ``interval`` has passed; never where the interval is 0."""
+
+    def __init__(self, interval: int) -> None:
+        self.interval = interval
+        self.next = interval
+
+    def __call__(self, count: int) -> bool:
+        """True once each time ``count`` reaches the next multiple (several passed at once count as one)."""
+        if not self.interval or count < self.next:
+            return False
+        self.next = count - count % self.interval + self.interval
+        return True
+
+
 class TrainingRecorder:
     """Counts every collected transition once.
 
@@ -56,6 +71,20 @@ class TrainingRecorder:
         self._recent = FilterStatistics(self.world.max_speed)
         self._cost = [0.0, 0]
         return scalars
+
+    def progress(self, scalars: dict[str, float]) -> str:
+        """What the progress bar shows beside frames per second."""
+        shown = f"return {scalars.get('train/return', float('nan')):.1f} J {scalars['train/coverage_cost']:.3f}"
+        return f"{shown} violations {sum(self.violations.values())}"
+
+    def summary(self) -> dict:
+        """The part of summary.json that training itself decides."""
+        return {
+            "frames": self.frames,
+            "episodes": self.episodes.episodes,
+            "train": {"violations": self.violations},
+            "filter": self.filter.summary(),
+        }
 
     def state_dict(self) -> dict:
         """Counters and finished episodes, for checkpoints."""

@@ -16,10 +16,9 @@ from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments
 from envs.density import Density
 from envs.dynamics import integrate, limit_speed
-from envs.homing import exchange_slots, is_certified, reassign_slots, reserve
+from envs.homing import reassign_slots
 from envs.metrics import violations
-
-RESET_DRAWS = 16  # candidate start states per world and reset; docked where none is certified
+from envs.starts import draw_starts
 
 
 class SurveillanceEnv(EnvBase):
@@ -203,44 +202,13 @@ class SurveillanceEnv(EnvBase):
         index = mask.nonzero().squeeze(-1)
         if index.numel() == 0:
             return
-        drawn = self._draw_start(index.numel())
+        batch = index.numel()
+        starts = draw_starts(batch, self.config, self.geometry, self.slots, self.bounds, self.generator)
+        drawn = dict(zip(("position", "energy", "slot"), starts, strict=True))
+        drawn["step"] = torch.zeros(batch, 1, dtype=torch.int64, device=self.device)
+        drawn["density"] = self.density.sample(batch, self.generator)
         for name, value in drawn.items():
             self._state[name] = self._state[name].index_copy(0, index, value)
-
-    def _draw_start(self, batch: int) -> dict[str, Tensor]:
-        """Certified states of ``batch`` worlds: the first certified of several draws, docked where there is none."""
-        c, g, n = self.config, self.geometry, self.config.n_agents
-        low, high = self.bounds.unbind(-1)
-        span = c.energy_max - c.energy_min
-        position = low + (high - low) * self._rand(batch, RESET_DRAWS, n, c.dimension)
-        share = self._rand(batch, RESET_DRAWS, n)
-        slot = torch.arange(n, device=self.device).expand(batch, RESET_DRAWS, n)
-        full = torch.full_like(share, c.energy_max)
-        for _ in range(n):  # rounds of the exchange, not robots: every round improves all worlds at once
-            slot = exchange_slots(position, full, slot, self.slots, g)
-        top = c.energy_max - g.eps_energy
-        least = min(c.energy_min + 2 * g.eps_energy + c.reset_reserve * span, top)
-        need = least + reserve((position - self.slots[slot]).norm(dim=-1), g)
-        energy = need + (top - need).clamp_min(0) * share
-        clearance = c.reset_clearance
-        certified = is_certified(position, energy, self.slots[slot], g, self.bounds, clearance=clearance)
-        certified &= (need <= top).all(dim=-1)
-        first = certified.to(torch.uint8).argmax(dim=1)
-        rows = torch.arange(batch, device=self.device)
-        position, energy, slot = position[rows, first], energy[rows, first], slot[rows, first]
-        found = certified.any(dim=1, keepdim=True)
-        docked = torch.arange(n, device=self.device).expand(batch, n)
-        slot = torch.where(found, slot, docked)
-        return {
-            "position": torch.where(found.unsqueeze(-1), position, self.slots[docked]),
-            "energy": torch.where(found, energy, least + (top - least) * share[:, 0]),
-            "slot": slot,
-            "step": torch.zeros(batch, 1, dtype=torch.int64, device=self.device),
-            "density": self.density.sample(batch, self.generator),
-        }
-
-    def _rand(self, *shape: int) -> Tensor:
-        return torch.rand(shape, generator=self.generator, dtype=self.config.torch_dtype, device=self.device)
 
     def _blank_state(self) -> TensorDict:
         zeros = {"dtype": self.config.torch_dtype, "device": self.device}

@@ -35,23 +35,13 @@ import torch
 from qpth.solvers.pdipm import batch as pdipm
 from torch import Tensor
 
-from safety.qp_exact import (
-    CHUNK_BYTES,
-    Metric,
-    QPStatus,
-    Raw,
-    kkt_residual,
-    norm,
-    normalise_rows,
-    pivoted_basis,
-    settle,
-    solve_exact,
-)
+from safety.kkt import QPStatus, Raw, kkt_residual, norm, normalise_rows, pivoted_basis
+from safety.qp_exact import CHUNK_BYTES, Metric, settle, solve_exact
 
 __all__ = ["KKT_TOL", "QPSolution", "QPStatus", "project_halfspaces_ball", "solve_qp"]
 
 KKT_TOL = {torch.float32: 1e-6, torch.float64: 1e-7}
-"""Largest relative KKT residual (`safety.qp_exact.kkt_residual`) that counts as SOLVED, by dtype of the input."""
+"""Largest relative KKT residual (`safety.kkt.kkt_residual`) that counts as SOLVED, by dtype of the input."""
 
 _SOLVERS = ("exact", "qpth")
 _CAP = 1.5  # slack rows end up at this multiple of the most they can need, given the bound on |u|

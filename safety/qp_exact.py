@@ -1,4 +1,4 @@
-"""Exact active-set solution of small quadratic programmes, and the linear algebra both QP solvers share.
+"""Exact active-set solution of small quadratic programmes.
 
 Problem (one per sample, flat batch B, always float64 here; see safety/qp.py for the public border):
 
@@ -16,20 +16,12 @@ Conventions: rows are normalised to unit norm (`normalise_rows`); a row that can
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-
-class QPStatus(IntEnum):
-    """What is known about a returned value; only SOLVED values may be executed."""
-
-    SOLVED = 0
-    INACCURATE = 1
-    INFEASIBLE = 2
-
+from safety.kkt import SCALE_FLOOR, TINY, QPStatus, Raw, column_norm, kkt_residual, norm, normalise_rows, pivoted_basis
 
 EARLY_STOP = 1e-12
 """KKT violation (relative) at which no larger active set is tried: a few thousand roundings of float64."""
@@ -38,160 +30,10 @@ RANK_TOL = 1e-12
 GRAZE = 1e-8
 """Least half-chord, relative to the radius, of a plane through the ball. A plane that only touches the ball has no
 multipliers; opening the chord by 1e-8 radii changes ‖u‖ by 5e-17 relative and makes them exist."""
-SCALE_FLOOR = 1e-3
-"""Lengths are compared with max(‖u‖, 1e-3 ‖unconstrained solution‖): a solution at the origin still has a scale."""
 CHUNK_BYTES = 256 * 2**20
 """Bound on the temporaries of one enumeration step, bytes."""
 ROOT_ITERATIONS = 80
 """Most steps of the search for the ball multiplier; 4 to 8 are usual."""
-
-_TINY = 1e-300
-
-
-class Raw(NamedTuple):
-    """Solution of a flat batch in float64.
-
-    Attributes:
-        u: (B, n) solution.
-        lam: (B, m) multipliers of the rows as they were given.
-        mu: (B,) ball multiplier μ, stationarity being Qu + p + Gᵀλ + μu = 0.
-        status: (B,) int64.
-        residual: (B,) relative KKT residual.
-        iterations: (B,) int64.
-    """
-
-    u: Tensor
-    lam: Tensor
-    mu: Tensor
-    status: Tensor
-    residual: Tensor
-    iterations: Tensor
-
-    @classmethod
-    def blank(cls, u: Tensor, m: int) -> Raw:
-        """SOLVED at `u` (B, n) with all m multipliers zero."""
-        zero = torch.zeros_like(u[:, 0])
-        count = torch.zeros_like(zero, dtype=torch.int64)
-        return cls(u.clone(), u.new_zeros(u.shape[0], m), zero, count, zero.clone(), count.clone())
-
-    def put(self, index: Tensor, part: Raw) -> None:
-        """Write `part` into the samples `index`, in place."""
-        for mine, theirs in zip(self, part, strict=True):
-            mine[index] = theirs
-
-
-def norm(x: Tensor) -> Tensor:
-    """Euclidean norm over the last dimension."""
-    return torch.linalg.vector_norm(x, dim=-1)
-
-
-def _length(x: Tensor) -> Tensor:
-    """Euclidean norm over the first dimension (torch's own reduces a short leading dimension ten times slower)."""
-    return (x * x).sum(0).sqrt()
-
-
-def normalise_rows(G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Scale rows to unit norm and replace those that can never bind by g = 0, h = 1.
-
-    Args:
-        G: (B, m, n) finite rows.
-        h: (B, m) bounds; +inf means no constraint.
-
-    Returns:
-        G (B, m', n), h (B, m'), row norms (B, m') and whether a zero row demands 0 ≤ h < 0 (B,). m' = max(m, 1).
-    """
-    if G.shape[1] == 0:
-        G, h = G.new_zeros(G.shape[0], 1, G.shape[2]), h.new_ones(h.shape[0], 1)
-    big = G.abs().amax(-1)
-    zero = big == 0
-    big = torch.where(zero, 1.0, big)  # two steps, or the squares of tiny rows would underflow
-    unit = G / big[..., None]
-    length = torch.where(zero, 1.0, norm(unit))
-    bound = (h / big / length).clamp(max=1e150)
-    idle = zero | torch.isposinf(h)
-    impossible = (zero & (h < 0)).any(-1)
-    unit = torch.where(idle[..., None], 0.0, unit / length[..., None])
-    return unit, torch.where(idle, 1.0, bound), big * length, impossible
-
-
-def kkt_residual(
-    Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, u: Tensor, lam: Tensor, mu: Tensor, radius: float | None
-) -> Tensor:
-    """Relative KKT residual: the largest of stationarity, row and ball violation, dual sign, complementarity.
-
-    Forces (stationarity, λ, μ·radius) are measured against max(‖p‖, ‖Qu‖), lengths (violations and slacks) against
-    max(‖u‖, 1e-3 min(‖Q⁻¹p‖, radius)). Complementarity of a row is min(λ, slack) in these units, which unlike the
-    product does not shrink quadratically. Rows must have unit norm, so the number does not depend on row scaling.
-
-    Args:
-        Q: (B, n, n) SPD, or None for the identity.
-        p: (B, n).
-        G: (B, m, n) unit rows.
-        h: (B, m).
-        u: (B, n).
-        lam: (B, m).
-        mu: (B,).
-        radius: length unit of u, or None.
-
-    Returns:
-        (B,) residual; +inf where anything is not finite.
-    """
-    Qu = u if Q is None else (Q @ u[..., None])[..., 0]
-    free = norm(p) if Q is None else norm(torch.linalg.solve_ex(Q, p[..., None])[0][..., 0])
-    free = free if radius is None else free.clamp(max=radius)
-    force = torch.maximum(norm(p), norm(Qu)).clamp(min=_TINY)
-    length = torch.maximum(norm(u), SCALE_FLOOR * free).clamp(min=_TINY)
-    gradient = Qu + p + (G * lam[..., None]).sum(1) + mu[:, None] * u
-    slack = (h - (G * u[:, None]).sum(-1)) / length[:, None]
-    dual = lam / force[:, None]
-    worst = torch.maximum(norm(gradient) / force, torch.minimum(dual, slack).abs().amax(-1))
-    if radius is not None:
-        gap = (radius - norm(u)) / radius
-        worst = torch.maximum(worst, torch.minimum(mu * radius / force, gap).abs())
-    return torch.where(torch.isfinite(worst), worst, torch.inf)
-
-
-class Basis(NamedTuple):
-    """Orthonormal basis of the span of chosen rows: rows[picks]ᵀ = axesᵀ·R, see `pivoted_basis`."""
-
-    axes: Tensor  # (B, k, n), zero where no independent row was left
-    picks: Tensor  # (B, k) row numbers
-    R: Tensor  # (B, k, k) upper triangular, unit diagonal where an axis is zero
-
-    def project(self, x: Tensor) -> Tensor:
-        """Component of x (B, n) orthogonal to the chosen rows."""
-        for _ in range(2):
-            x = x - ((self.axes @ x[..., None]) * self.axes).sum(1)
-        return x
-
-
-def pivoted_basis(rows: Tensor, active: Tensor, weight: Tensor | None = None) -> Basis:
-    """Pick up to n linearly independent rows among the active ones by pivoted Gram-Schmidt.
-
-    Redundant rows are simply never picked, so nothing downstream is singular.
-
-    Args:
-        rows: (B, m, n) unit rows.
-        active: (B, m) bool.
-        weight: (B, m) preference among the rows, positive; default all alike.
-    """
-    left = rows * active[..., None]
-    axes, picks = [], []
-    for _ in range(min(rows.shape[1:])):
-        size = norm(left)
-        pick = torch.where(size > 1e-10, size if weight is None else size * weight, 0.0).argmax(-1)
-        chosen = left[torch.arange(len(left), device=left.device), pick]
-        length = norm(chosen)[:, None]
-        axis = torch.where(length > 1e-10, chosen / length.clamp(min=_TINY), 0.0)
-        for _ in range(2):  # twice is enough (Kahan)
-            left = left - (left @ axis[..., None]) * axis[:, None]
-        axes.append(axis)
-        picks.append(pick)
-    A, order = torch.stack(axes, 1), torch.stack(picks, 1)
-    R = (A @ rows.gather(1, order[..., None].expand_as(A)).mT).triu()
-    dead = ~A.any(-1)
-    R = torch.where(dead[:, :, None] | dead[:, None, :], 0.0, R) + torch.diag_embed(dead.to(R.dtype))
-    return Basis(A, order, R)
 
 
 def _candidates(
@@ -223,7 +65,7 @@ def _candidates(
             for i in range(j):
                 part = (v * axes[i]).sum(0)
                 v, coef[i] = v - part * axes[i], coef[i] + part
-        size = _length(v)
+        size = column_norm(v)
         ok = ok & (size > RANK_TOL)
         size = torch.where(size > RANK_TOL, size, 1.0)
         rest = h[:, sets[:, j]]
@@ -241,9 +83,9 @@ def _candidates(
             flat = flat - axis * (axis * flat).sum(0)
     c = torch.ones_like(foot[0])
     if radius is not None and k < n:
-        away = _length(foot)
+        away = column_norm(foot)
         half = ((radius - away) * (radius + away)).clamp(min=(GRAZE * radius) ** 2).sqrt()
-        c = (_length(flat) / half).clamp(min=1.0)
+        c = (column_norm(flat) / half).clamp(min=1.0)
     u = foot + flat / c
     lam: list[Tensor] = [c] * k
     for j in reversed(range(k)):
@@ -252,15 +94,15 @@ def _candidates(
             rest = rest - R[i][j] * lam[i]
         lam[j] = rest / R[j][j]
 
-    size, target = _length(u), norm(t)[:, None]
+    size, target = column_norm(u), norm(t)[:, None]
     length = torch.maximum(size, SCALE_FLOOR * (target if radius is None else target.clamp(max=radius)))
-    primal = torch.baddbmm(-h[..., None], G, u.transpose(0, 1)).amax(1) / length.clamp(min=_TINY)
+    primal = torch.baddbmm(-h[..., None], G, u.transpose(0, 1)).amax(1) / length.clamp(min=TINY)
     if radius is not None:
         primal = torch.maximum(primal, size / radius - 1)
     dual = torch.zeros_like(size)
     for x in lam:
         dual = torch.maximum(dual, -x)
-    dual = dual / torch.maximum(target, size).clamp(min=_TINY)
+    dual = dual / torch.maximum(target, size).clamp(min=TINY)
     ok = ok & torch.isfinite(primal) & torch.isfinite(dual)
     primal, dual = torch.where(ok, primal.clamp(min=0.0), torch.inf), torch.where(ok, dual, torch.inf)
     return u.permute(1, 2, 0), torch.stack(lam, -1) if k else c[..., None][..., :0], c, primal, dual
@@ -431,7 +273,7 @@ def _find_ball_multiplier(
         lo[todo] = torch.where(size > radius, tau, lo[todo])
         hi[todo] = torch.where(size > radius, hi[todo], tau)
         slope = norm(pivoted_basis(metric.rows, dual > 0).project(metric.down(v))).square()  # uᵀ(du/dμ) = -slope
-        newton = mu[todo] + (size / radius - 1) * size.square() / slope.clamp(min=_TINY)
+        newton = mu[todo] + (size / radius - 1) * size.square() / slope.clamp(min=TINY)
         newton = newton / (newton + s[todo])
         left[todo] = torch.where(size > radius, newton, left[todo])
         a, b, start = lo[todo], hi[todo], left[todo]

@@ -172,7 +172,7 @@ def reserve_by_hand(distance, world):
     return DRAIN / rate * (distance / radius).log().clamp(min=0)
 
 
-def sampled_case(world, d, *, share, seed):
+def sampled_case(world, d, *, share, seed, gain=0.2):
     """States with h_c = share (0 <= share <= 1): position, energy, next energy, barrier, row."""
     gen = torch.Generator().manual_seed(seed)
     batch = share.shape[0]
@@ -186,9 +186,9 @@ def sampled_case(world, d, *, share, seed):
     field = ((world.charge_radius - distance) / (world.charge_radius - world.charge_radius_full)).clamp(0, 1)
     field = field**2 * (3 - 2 * field)
     next_energy = energy + world.dt * (CHARGE * field - DRAIN)  # nowhere near E_max: the battery accepts all
-    gain, step = 0.2, world.max_speed * world.dt
+    step = world.max_speed * world.dt
     row = sampled_energy_row(position, energy, next_energy, slot, world.homing, gain=gain, step=step)
-    return position, slot, energy, next_energy, distance, floor, gain, row
+    return position, slot, next_energy, distance, floor, row
 
 
 def speeds(world, batch, count, d, seed):
@@ -202,11 +202,12 @@ def speeds(world, batch, count, d, seed):
 
 @FAMILIES
 @DIMENSIONS
-def test_sampled_row_keeps_the_barrier_for_every_velocity(family, d):
+@pytest.mark.parametrize("gain", [0.2, 1.0])
+def test_sampled_row_keeps_the_barrier_for_every_velocity(family, d, gain):
     world = make_world(family, d)
     share = torch.rand(1500, generator=torch.Generator().manual_seed(1), dtype=F64) ** 4 * 0.3
     share[:300] = 0
-    position, slot, _, next_energy, _, floor, gain, row = sampled_case(world, d, share=share, seed=2)
+    position, slot, next_energy, _, floor, row = sampled_case(world, d, share=share, seed=2, gain=gain)
     value, normal, bound = row
     torch.testing.assert_close(value, share, rtol=0, atol=1e-12)
 
@@ -227,19 +228,19 @@ def test_sampled_row_is_feasible_in_the_safe_set(family, d):
     world = make_world(family, d)
     share = torch.rand(3000, generator=torch.Generator().manual_seed(5), dtype=F64) ** 4 * 0.3
     share[:1000] = 0
-    *_, distance, _, _, (_, _, bound) = sampled_case(world, d, share=share, seed=6)
+    *_, distance, _, (_, _, bound) = sampled_case(world, d, share=share, seed=6)
     fastest = -2 * world.dt * distance * world.max_speed  # least value of the row in the ball: straight home
     assert (bound - fastest).min() >= -1e-12
     assert (bound < 0).any()  # standing still is not always enough
 
 
 @DIMENSIONS
-def test_sampled_row_is_feasible_inside_the_rounding_margin(d):
+@pytest.mark.parametrize("gain", [0.2, 1.0])
+def test_sampled_row_is_feasible_inside_the_rounding_margin(d, gain):
     world = make_world("linear", d)
     share = -world.homing.eps_energy * torch.rand(2000, generator=torch.Generator().manual_seed(7), dtype=F64)
-    position, slot, _, next_energy, distance, floor, _, (value, normal, bound) = sampled_case(
-        world, d, share=share, seed=8
-    )
+    position, slot, next_energy, distance, floor, row = sampled_case(world, d, share=share, seed=8, gain=gain)
+    value, normal, bound = row
     assert (value < 0).all()
     assert (bound + 2 * world.dt * distance * world.max_speed).min() >= -1e-12
     # and whatever it admits leads no deeper into the margin

@@ -342,7 +342,9 @@ def test_reward_is_the_cost_in_units_of_the_docked_uniform_cost(family, d):
         got = float(td["next", keys.COVERAGE_COST][b, t])
         assert got == pytest.approx(cost + env.density.cell_moment, rel=1e-9)
         reward = td["next", keys.REWARD][b, t].squeeze(-1).tolist()
-        assert reward == pytest.approx([-got / (docked + env.density.cell_moment)] * 3, rel=1e-9)
+        # J_ref is under the uniform density for every family: the mean over points plus one cell's own second moment
+        moment = sum(((high - low) / 9) ** 2 / 12 for low, high in env.config.bounds)
+        assert reward == pytest.approx([-got / (docked + moment)] * 3, rel=1e-9)
 
 
 def test_reward_of_docked_robots_under_a_uniform_density_is_minus_one():
