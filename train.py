@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents.checkpoint import keep_newest, save_checkpoint
+from agents.checkpoint import keep_newest, save_checkpoint, set_aside
 from agents.evaluation import evaluate_policy, evaluation_scalars
 from agents.maddpg import make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
@@ -41,6 +41,7 @@ def main(cfg: DictConfig) -> None:
     if config.resume == "auto" and (folder / "summary.json").is_file():
         tqdm.write(f"{folder} holds a finished run: nothing to do. resume=never trains it anew.")
         return
+    set_aside(folder)
 
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     start, device = time.perf_counter(), pick_device(config.device)

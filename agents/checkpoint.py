@@ -24,12 +24,32 @@ def save_checkpoint(path: Path, content: dict) -> Path:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        torch.save({"format": FORMAT, **content}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            torch.save({"format": FORMAT, **content}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)  # left over only if writing failed
     return path
+
+
+def set_aside(folder: Path) -> Path | None:
+    """Move what an earlier run wrote into ``folder`` to ``replaced_<k>`` inside it, so that nothing is mixed or lost.
+
+    Returns:
+        The folder moved to; None if there was nothing.
+    """
+    patterns = ("checkpoints", "figures", "eval", "summary.json", "events.out.tfevents.*")
+    found = [path for pattern in patterns for path in folder.glob(pattern)]
+    if not found:
+        return None
+    target = folder / f"replaced_{1 + len(list(folder.glob('replaced_*')))}"
+    target.mkdir()
+    for path in found:
+        path.rename(target / path.name)
+    return target
 
 
 def keep_newest(folder: Path, keep: int) -> None:

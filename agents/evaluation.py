@@ -73,7 +73,9 @@ def evaluate_policy(
 
 def evaluation_scalars(metrics: dict) -> dict[str, float]:
     """The numbers of :func:`evaluate_policy`'s metrics by TensorBoard tag."""
-    scalars = {f"eval/{name}": value for name, value in metrics.items() if isinstance(value, int | float)}
+    scalars: dict[str, float] = {
+        f"eval/{name}": value for name, value in metrics.items() if isinstance(value, int | float)
+    }
     return scalars | {f"eval/violations_{kind}": count for kind, count in metrics["violations"].items()}
 
 

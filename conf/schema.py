@@ -126,7 +126,8 @@ class Config:
     device: str = "auto"
     """auto | cpu | cuda."""
     resume: str = "auto"
-    """auto: a finished run is left alone. never: start anew in the same folder."""
+    """auto: a finished run is left alone, an unfinished one starts anew. never: start anew in the same folder.
+    What an earlier run left there is moved to replaced_<k>."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)

@@ -5,7 +5,14 @@ import os
 import pytest
 import torch
 
-from agents.checkpoint import CheckpointError, check_world, latest_checkpoint, load_checkpoint, save_checkpoint
+from agents.checkpoint import (
+    CheckpointError,
+    check_world,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+    set_aside,
+)
 
 torch.set_num_threads(1)
 
@@ -131,3 +138,16 @@ def test_world_of_another_size(tmp_path):
     assert "leave env out" in message
     with pytest.raises(CheckpointError, match="n_agents is None there, 3 here"):
         check_world(path, {"dimension": 2, "n_observation": 18}, world)
+
+
+def test_set_aside_keeps_an_earlier_run_whole(tmp_path):
+    assert set_aside(tmp_path) is None
+    for k in (1, 2):
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / f"frames_{k}.pt").write_bytes(b"x")
+        (tmp_path / "summary.json").write_text(str(k))
+        (tmp_path / ".hydra").mkdir(exist_ok=True)
+        assert set_aside(tmp_path) == tmp_path / f"replaced_{k}"
+        assert (tmp_path / f"replaced_{k}" / "summary.json").read_text() == str(k)
+        assert (tmp_path / f"replaced_{k}" / "checkpoints" / f"frames_{k}.pt").exists()
+        assert {path.name for path in tmp_path.iterdir() if not path.name.startswith("replaced")} == {".hydra"}

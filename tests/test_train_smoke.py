@@ -115,6 +115,10 @@ def test_same_seed_same_result(program, tmp_path):
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         results.append((summary["eval"], summary["filter"], summary["train"]))
     assert results[0] == results[1]
+    again = ("experiment=smoke", "collector.total_frames=256", "hydra.run.dir=a", "resume=never")
+    code, _ = program(train.main, *again)
+    assert json.loads((tmp_path / "a" / "summary.json").read_text())["eval"] == results[0][0]
+    assert (tmp_path / "a" / "replaced_1" / "summary.json").exists()
     code, _ = program(train.main, "experiment=smoke", "collector.total_frames=256", "hydra.run.dir=c", "seed=1")
     other = json.loads((tmp_path / "c" / "summary.json").read_text())
     assert other["eval"] != results[0][0]
