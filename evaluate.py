@@ -7,21 +7,24 @@ paper's Figs 5-7, a GIF and the battery plot of the first world.
 
 import json
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents import make_controller
-from agents.checkpoint import latest_checkpoint, load_checkpoint
+from agents.checkpoint import find_checkpoint, load_checkpoint
 from agents.evaluation import evaluate_policy
 from agents.networks import make_actor
 from agents.pipeline import pick_device
 from conf.callbacks import one_clear_error
 from conf.schema import EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
+from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
 from safety import SafetyConfig, SafetyFilter
@@ -39,25 +42,38 @@ def main(cfg: DictConfig) -> None:
     world: SurveillanceConfig = config.env
     safety: SafetyConfig = config.safety
     folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = None
+    env_seed, controller_seed = np.random.SeedSequence(config.seed).generate_state(2).tolist()
     if config.run is not None:
         trained = run_config(cfg, list(HydraConfig.get().overrides.task))
         world, safety = trained.env, trained.safety
-        env = SurveillanceEnv(world, config.num_envs, device, seed=config.seed)
+        env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
         nominal = make_actor(env.n_observation, world, trained.agent).to(device)
-        nominal.load_state_dict(load_checkpoint(latest_checkpoint(Path(config.run)), device)["actor"])
+        checkpoint = find_checkpoint(Path(config.run), config.checkpoint)
+        nominal.load_state_dict(load_checkpoint(checkpoint, device)["actor"])
     else:
-        env = SurveillanceEnv(world, config.num_envs, device, seed=config.seed)
-        nominal = make_controller(config.controller or "", world, seed=config.seed)
+        env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
+        nominal = make_controller(config.controller or "", world, seed=controller_seed)
     policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
     steps = config.steps or rollout_steps(world.horizon)
     metrics, statistics, trajectory = evaluate_policy(env, policy, steps, record=config.pictures)
-    content = {**metrics, "filter": statistics, "steps": steps, "num_envs": config.num_envs, "seed": config.seed}
+    content = {
+        **metrics,
+        "filter": statistics,
+        "steps": steps,
+        "num_envs": config.num_envs,
+        "seed": config.seed,
+        "policy": config.controller or str(checkpoint),
+        "git_hash": git_hash(),
+        "env": asdict(world),
+        "safety": asdict(safety),
+    }
     write_json(folder / "eval.json", content)
     if trajectory is not None:
         save_snapshots(trajectory, folder)
         save_battery_plot(trajectory, folder / "battery.png")
         save_gif(trajectory, folder / "world.gif", max_frames=60)
-    tqdm.write(f"{folder}/eval.json\n{json.dumps(content, indent=2)}")
+    tqdm.write(f"{folder}/eval.json\n{json.dumps(metrics | {'filter': statistics}, indent=2)}")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@
 
 import json
 import logging
+import sys
 import time
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from tqdm import tqdm
 
 from agents.checkpoint import keep_newest, save_checkpoint, set_aside
 from agents.evaluation import evaluate_policy, evaluation_scalars
-from agents.maddpg import make_loss, make_optimizers, update_step
+from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import Every, TrainingRecorder
@@ -86,11 +87,13 @@ def main(cfg: DictConfig) -> None:
 
     # ---- train: noise, then filter, then execution (explore_policy); the buffer holds executed actions
     log_due = Every(max(1, config.collector.total_frames // 200))
-    eval_due, checkpoint_due = Every(config.eval.interval_frames), Every(config.checkpoint.interval_episodes)
+    eval_due, save_due = Every(config.eval.interval_frames), Every(config.checkpoint.interval_frames)
+    episodes_due = Every(config.checkpoint.interval_episodes)
     seconds = {"collect": 0.0, "update": 0.0, "evaluate": 0.0}
     losses: dict[str, torch.Tensor] = {}
     evaluate()  # the untrained policy
-    bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=1.0)
+    interval = 1.0 if sys.stderr.isatty() else 30.0  # a line now and then in a log file
+    bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=interval)
     mark = time.perf_counter()
     for batch in collector:
         recorder.update(batch)
@@ -102,14 +105,16 @@ def main(cfg: DictConfig) -> None:
         updated = time.perf_counter()
         if log_due(recorder.frames):
             scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
-            log(scalars | {f"loss/{name}": float(value) for name, value in losses.items()})
+            numbers = {name: float(value) for name, value in losses.items()}
+            check_finite(numbers, recorder.frames)
+            log(scalars | {f"loss/{name}": value for name, value in numbers.items()})
             log({f"time/{name}_s": value for name, value in seconds.items()})
             log({"time/frames_per_second": recorder.frames / (updated - start)})
-            bar.set_postfix_str(recorder.progress(scalars))
+            bar.set_postfix_str(recorder.progress(scalars), refresh=False)
         bar.update(batch.numel())
-        if eval_due(recorder.frames):
+        if eval_due(recorder.frames) and recorder.frames < config.collector.total_frames:  # the last one follows below
             evaluate()
-        if checkpoint_due(recorder.episodes.episodes):
+        if save_due(recorder.frames) | episodes_due(recorder.episodes.episodes):
             checkpoint()
         seconds["collect"] += collected - mark
         seconds["update"] += updated - collected

@@ -86,12 +86,17 @@ def latest_checkpoint(run: Path) -> Path:
     Raises:
         CheckpointError: if there is none.
     """
-    found = sorted((run / "checkpoints").glob("*.pt"), key=lambda path: (path.stat().st_mtime, path.name))
+    found = sorted((run / "checkpoints").glob("*.pt"))  # named by frames, zero-padded
     if not found:
         raise CheckpointError(
             f"run={run} has no checkpoint in {run / 'checkpoints'}: give the folder of a run that wrote one."
         )
     return found[-1]
+
+
+def find_checkpoint(run: Path, name: str | None) -> Path:
+    """The named checkpoint of a run folder, or its newest (existence of a named one is left to :func:`load_checkpoint`)."""
+    return latest_checkpoint(run) if name is None else run / "checkpoints" / name
 
 
 def check_world(path: Path, found: dict, needed: dict) -> None:

@@ -131,7 +131,8 @@ class CoverageCBFLiteral(CoverageCBF):
     """:class:`CoverageCBF` with the survivability and collision rows in the same joint quadratic program.
 
     Hessian ``I + kappa grad J grad J^T`` once the slack is eliminated. A problem without solution holds (u = 0).
-    Run it with ``safety=none`` for the literature's controller as it stands.
+    The accepted current is not a controller's to write: behind ``safety=none`` it is 1, so that the overcharge row is
+    missing there; run it behind ``safety=paper`` for the literature's controller with its current.
     """
 
     def __init__(self, world: SurveillanceConfig, seed: int = 0) -> None:

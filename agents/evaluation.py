@@ -54,7 +54,7 @@ def evaluate_policy(
         distance_margin = torch.minimum(distance_margin, torch.where(alive.squeeze(-1), gap, math.inf).min())
         charges.update(energy, next_energy, alive)
         statistics.update(td, alive)
-        if history is not None:
+        if history is not None and alive[0]:
             history.add(k, td)
         alive = alive & ~following["terminated"]
         td = step_mdp(td)

@@ -8,6 +8,8 @@ Source: Lowe et al., Multi-agent actor-critic for mixed cooperative-competitive 
 Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 1509.02971.
 """
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -18,6 +20,20 @@ from agents.config import AgentConfig
 from agents.networks import JOINT_ACTION, STATE_ACTION_VALUE, joint_action
 from envs import SurveillanceConfig, keys
 from safety import SafetyConfig, SafetyFilter
+
+
+class DivergedError(ValueError):
+    """Losses or gradients that are not finite; the message names them and the remedy."""
+
+
+def check_finite(metrics: dict[str, float], frames: int) -> None:
+    """Raise :class:`DivergedError` if a number of :func:`update_step` is not finite."""
+    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
+    if bad:
+        raise DivergedError(
+            f"training diverged at frame {frames}: {', '.join(bad)} not finite. The last checkpoint is kept. Lower agent.actor_lr "
+            "and agent.critic_lr, set agent.max_grad_norm, or look for a policy that produces NaN behind safety=none."
+        )
 
 
 class MADDPGLoss(DDPGLoss):

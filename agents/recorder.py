@@ -1,5 +1,6 @@
 """What a training run measures: violations, episodes and filter over the batches, in numbers for log and summary."""
 
+import torch
 from tensordict import TensorDictBase
 
 from envs import SurveillanceConfig, keys
@@ -46,7 +47,9 @@ class TrainingRecorder:
         flags = {kind: following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS}
         for kind, flag in flags.items():
             self.violations[kind] += int(flag.sum())
-        violating = sum(flag.sum(-1) for flag in flags.values())
+        violating = (
+            torch.stack(list(flags.values())).any(dim=0).sum(-1)
+        )  # robot-steps: a robot may violate twice at once
         self.episodes.update(following[keys.REWARD][..., 0, 0], violating, following["done"].squeeze(-1))
         self.filter.update(batch)
         self._recent.update(batch)

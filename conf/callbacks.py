@@ -15,9 +15,17 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from agents.checkpoint import CheckpointError
+from agents.maddpg import DivergedError
 from conf.schema import check_evaluation, to_config
 
-EXPECTED = (ValueError, KeyError, OSError, OmegaConfBaseException)
+EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
+EXPECTED_IN_RUN = (
+    CheckpointError,
+    DivergedError,
+    OSError,
+    OmegaConfBaseException,
+)  # anything else is a programming error
 
 
 def fail(error: BaseException) -> None:
@@ -43,7 +51,8 @@ class ValidateConfig(Callback):
             self.check(config)
         except EXPECTED as error:
             if config.get("debug", False):
-                raise SystemExit(_traceback(error)) from error
+                traceback.print_exception(error)
+                sys.exit(1)
             fail(error)
         folder = Path(str(config.hydra.run.dir))
         if config.get("resume") == "auto" and (folder / "summary.json").is_file():
@@ -57,10 +66,6 @@ class ValidateEvaluation(ValidateConfig):
     check = staticmethod(check_evaluation)
 
 
-def _traceback(error: BaseException) -> str:
-    return "".join(traceback.format_exception(error))
-
-
 def one_clear_error(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
     """Decorate a Hydra main: an expected error ends a single run with one message, and fails one job of a multirun.
 
@@ -71,7 +76,7 @@ def one_clear_error(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
     def wrapper(cfg: DictConfig) -> None:
         try:
             main(cfg)
-        except EXPECTED as error:
+        except EXPECTED_IN_RUN as error:
             multirun = HydraConfig.get().mode == RunMode.MULTIRUN
             if multirun or cfg.get("debug", False) or os.environ.get("HYDRA_FULL_ERROR") == "1":
                 raise

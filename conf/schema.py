@@ -10,7 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import AgentConfig
-from agents.checkpoint import check_world, latest_checkpoint, load_checkpoint
+from agents.checkpoint import check_world, find_checkpoint, load_checkpoint
 from agents.controllers import CONTROLLERS
 from agents.pipeline import pick_device
 from envs import SurveillanceConfig, SurveillanceEnv
@@ -107,13 +107,16 @@ class CheckpointConfig:
     """Checkpoints."""
 
     interval_episodes: int = 2_000
-    """Episodes between checkpoints, >= 0 (0 = only at the end)."""
+    """Episodes between checkpoints, >= 0 (0 = do not count episodes)."""
+    interval_frames: int = 256_000
+    """World-steps between checkpoints, >= 0 (0 = do not count frames): for worlds whose episodes do not end."""
     keep: int = 3
     """Newest checkpoints kept, >= 0 (0 = all)."""
 
     def __post_init__(self) -> None:
         """Check every field."""
         check_range("checkpoint.interval_episodes", self.interval_episodes, 0, 10**12)
+        check_range("checkpoint.interval_frames", self.interval_frames, 0, 10**13)
         check_range("checkpoint.keep", self.keep, 0, 10**6)
 
 
@@ -128,6 +131,8 @@ class Config:
     resume: str = "auto"
     """auto: a finished run is left alone, an unfinished one starts anew. never: start anew in the same folder.
     What an earlier run left there is moved to replaced_<k>."""
+    compile: bool = False
+    """Compile the pure tensor functions; not available yet, true is refused."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
@@ -143,6 +148,8 @@ class Config:
         """Check the combinations that no group can check alone."""
         _check_common(self)
         check_choice("resume", self.resume, ("auto", "never"))
+        if self.compile:
+            raise ValueError("compile=true is not available yet: use compile=false.")
         self.safety.gains(self.env)
         if self.agent.correction_penalty and not self.safety.in_loss:
             raise ValueError(
@@ -159,6 +166,8 @@ class EvaluateConfig:
     """Folder of a training run (its world and filter are used, with env.* and safety.* overrides applied to them)."""
     controller: str | None = None
     """Name of a controller that is not learned."""
+    checkpoint: str | None = None
+    """File in the run's checkpoints folder, such as frames_000000100000.pt; null = the newest."""
     steps: int = 0
     """Length of the rollout; 0 = the world's horizon (1000 where it has none)."""
     num_envs: int = 64
@@ -240,7 +249,7 @@ def check_evaluation(cfg: DictConfig) -> None:
     config = to_config(cfg)
     if config.run is not None:
         world = run_config(cfg, list(cfg.hydra.overrides.task)).env
-        path = latest_checkpoint(Path(config.run))
+        path = find_checkpoint(Path(config.run), config.checkpoint)
         check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(world)))
 
 
@@ -257,7 +266,10 @@ def _plain(cfg: DictConfig, name: str) -> Any:
 
 
 def evaluation_folder(cfg: DictConfig) -> str:
-    """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers."""
+    """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers.
+
+    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten.
+    """
     choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
     world, horizon = choices.env, cfg.env.horizon
     if cfg.run is not None and not any(entry.startswith("env=") for entry in overrides):
@@ -266,8 +278,10 @@ def evaluation_folder(cfg: DictConfig) -> str:
         if not any(entry.startswith("env.horizon=") for entry in overrides):
             horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
     name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in ("env", "safety", "checkpoint")]
     if cfg.run is not None:
-        return f"{cfg.run}/eval/{name}"
+        suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
+        return f"{cfg.run}/eval/{name}{suffix}"
     return f"runs/controllers/{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
 
 

@@ -90,7 +90,8 @@ class SurveillanceConfig:
     resolution: int = 0
     """Quadrature points per axis, 2..512; 0 = 20 in 2-D (RMS error of J below 1 %) and 10 in 3-D (1.5 %)."""
     on_violation: str = "terminate"
-    """terminate: the first violation ends the episode. continue: every one counts, a drained robot stands still."""
+    """terminate: the first violation ends the episode. continue: every one counts, a drained robot stands still.
+    (It then executes u = 0 whatever ("agents", "action") says.)"""
     reserve: str = "linear"
     """Reserve family rho: linear (drive home at homing_speed) | logarithmic (exponential approach; needs more reserve)."""
     homing_speed: float = 0.98

@@ -12,11 +12,11 @@ def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
         max_speed: radius of the ball, m/s.
 
     Returns:
-        ``(*B, N, d)``, m/s, norm at most ``max_speed`` up to rounding.
+        ``(*B, N, d)``, m/s, norm at most ``max_speed``.
     """
     speed = velocity.norm(dim=-1, keepdim=True)
-    # The tolerance keeps the map idempotent in float32: an action cut once is not cut again.
-    return torch.where(speed > max_speed * (1 + 1e-6), velocity * (max_speed / speed.clamp_min(1e-30)), velocity)
+    # Cut to a hair below the limit: rounding must not lift a norm above it, and a velocity cut once is not cut again.
+    return torch.where(speed > max_speed, velocity * (max_speed * (1 - 1e-6) / speed.clamp_min(1e-30)), velocity)
 
 
 def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:

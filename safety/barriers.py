@@ -4,10 +4,12 @@ State chi = (p, E), input u~ = (u, c): ``p' = u``, ``E' = -K_d + K_c w(p) c``. A
 
     L_F h + L_G h u~ >= -alpha h.
 
-Signs: every function returns ``h`` (safe where >= 0) and the row's parts. The rows are the literature's continuous-time
-ones, without sampled-data margins: under a step of finite length they leak (the certified filter mends that).
+Signs: every function returns ``h`` (safe where >= 0) and the row's parts. The three barriers' rows are the literature's
+continuous-time ones, without margins: under a step of finite length they leak. :func:`sampled_energy_row` is the
+survivability row on the exact one-step map.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -110,7 +112,10 @@ def sampled_energy_row(
     if geometry.family == "linear":
         cautious = (step - geometry.speed * geometry.dt) * geometry.drain_rate / (geometry.speed * geometry.eps_energy)
     else:
-        cautious = gain
+        # D (1 - k dt) (1 - exp(-k~ g eps / K_d)) <= U - k dt D at the farthest D, the arena's diagonal v / k
+        farthest = geometry.speed / geometry.gain * (1 - geometry.gain * geometry.dt)
+        spare_step = (step - geometry.speed * geometry.dt) / farthest
+        cautious = -geometry.drain_rate / (geometry.decay * geometry.eps_energy) * math.log1p(-spare_step)
     kept = 1 - torch.where(value < 0, min(gain, cautious), gain)
     spare = next_energy - floor - kept * value
     if geometry.family == "linear":

@@ -68,7 +68,18 @@ class SafetyConfig:
         for name, share in defaults.items():
             value = getattr(self, name)
             gain = share / world.dt if value is None else value
-            hint = f"alpha dt must not exceed 1 (env.dt={world.dt}); null chooses {share / world.dt:g}."
-            check_range(f"safety.{name}", gain, 0, 1 / world.dt, open_low=True, hint=hint)
+            # "The other robot stands still" counts the approach of both for one: half the gain is the sharp bound.
+            most = 0.5 if name == "alpha_s" and self.split == "full" else 1.0
+            hint = f"alpha dt must not exceed {most:g} (env.dt={world.dt}); null chooses {share / world.dt:g}."
+            check_range(f"safety.{name}", gain, 0, most / world.dt, open_low=True, hint=hint)
             gains.append(gain)
+        spread = world.max_drain_rate - world.drain_rate
+        needed = 3 * world.homing.eps_energy + world.dt * (
+            world.max_drain_rate + spread * (1 + 1 / (gains[1] * world.dt))
+        )
+        if self.mode != "none" and spread and world.energy_max - world.energy_min <= needed:
+            raise ValueError(
+                f"safety.alpha_o={gains[1]:g} throttles charging below the drain at full speed: env.energy_max - env.energy_min = "
+                f"{world.energy_max - world.energy_min:g} must exceed {needed:.4g}. Raise safety.alpha_o."
+            )
         return tuple(gains)

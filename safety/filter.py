@@ -49,7 +49,7 @@ class SafetyFilter(TensorDictModuleBase):
       ``(*B, N, 1)`` = ||u - u^|| with u^ first cut to the speed ball, status and level ``(*B, N)`` int64, residual
       and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``.
 
-    A non-finite nominal action is replaced by hold, flagged INACCURATE and counted.
+    A non-finite nominal action is replaced by hold, flagged INACCURATE and counted, as a correction of max_speed.
 
     Args:
         safety: which filter.
@@ -119,6 +119,7 @@ class SafetyFilter(TensorDictModuleBase):
         difference = (action - cut).nan_to_num()
         squared = difference.square().sum(-1, keepdim=True)
         correction = torch.where(squared > 0, squared.clamp_min(torch.finfo(squared.dtype).tiny).sqrt(), 0.0)
+        correction = torch.where(finite.unsqueeze(-1), correction, self.world.max_speed)
         return (
             *(action, current.unsqueeze(-1), correction, status, level, residual.unsqueeze(-1)),
             *(h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value.amin(dim=-1, keepdim=True)),
@@ -182,7 +183,8 @@ class SafetyFilter(TensorDictModuleBase):
             identity = torch.eye(target.shape[-1], dtype=target.dtype, device=target.device)
             solution = solve_qp(identity, -target, G, h, solver="qpth")
         else:
-            solution = project_halfspaces_ball(target, G, h, radius)
+            # half of limit_speed's hair: cut targets stay as they are, and rounding stays inside the ball
+            solution = project_halfspaces_ball(target, G, h, radius * (1 - 5e-7))
         return solution.value, solution.status, solution.residual
 
     def _solve_joint(

@@ -57,7 +57,11 @@ def test_paper_run_is_the_papers_budget():
     assert config.train.n_updates == 1
     assert config.checkpoint.interval_episodes == 100
     literal = to_config(composed("experiment=paper_literal"))
-    assert literal.train.n_updates * literal.collector.total_frames // literal.collector.frames_per_batch == 1_000_000
+    for run, updates in ((config, 10_000), (literal, 1_000_000)):
+        # as train.py counts: an update after every batch whose frames have reached the warm-up
+        per_batch, total = run.collector.frames_per_batch, run.collector.total_frames
+        batches = sum(frames >= run.train.warmup_frames for frames in range(per_batch, total + 1, per_batch))
+        assert batches * run.train.n_updates == updates
 
 
 def test_literal_filter_is_one_row_with_full_responsibility():

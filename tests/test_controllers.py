@@ -114,7 +114,7 @@ def test_lloyd_heads_for_the_centroid_of_its_cell():
     td = make_controller("lloyd", world)(env.set_state(position, torch.full((1, 2, 1), 0.9)))
     expected = torch.tensor([[[-0.19, 0.0], [0.19, 0.0]]], dtype=F64) / world.dt
     expected = expected * world.max_speed / expected.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(td[keys.NOMINAL_ACTION], expected)
+    torch.testing.assert_close(td[keys.NOMINAL_ACTION], expected, rtol=2e-6, atol=1e-15)
     near = position.sign() * torch.tensor([0.49, 0.0], dtype=F64)  # one step away it stops there
     td = make_controller("lloyd", world)(env.set_state(near, torch.full((1, 2, 1), 0.9)))
     torch.testing.assert_close(

@@ -39,8 +39,8 @@ def test_speeds_outside_land_on_the_sphere_in_the_same_direction(d, dtype):
     assert (speed > 0.2).mean() > 0.9
     got = limit_speed(velocity, 0.2)
     assert got.dtype == dtype
-    np.testing.assert_allclose(got.double().numpy(), expected, rtol=1e-6, atol=0)
-    assert got.norm(dim=-1).max() <= 0.2 * (1 + 1e-6)
+    np.testing.assert_allclose(got.double().numpy(), expected, rtol=2e-6, atol=0)  # cut a hair (1e-6) below the limit
+    assert got.double().norm(dim=-1).max() <= 0.2  # never above it, not by one rounding
 
 
 def test_one_fast_robot_does_not_touch_the_others():

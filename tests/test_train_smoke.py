@@ -99,6 +99,18 @@ def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
         with Image.open(target / name) as picture:
             assert picture.size[0] > 300
 
+    first = sorted((folder / "checkpoints").glob("*.pt"))[0].name
+    arguments = (f"run={folder}", "steps=30", "num_envs=3", "pictures=false")
+    code, output = program(evaluate.main, *arguments, f"checkpoint={first}", "safety=none")
+    assert code == 0, output
+    (other,) = folder.glob("eval/default_30_0_*/eval.json")  # the run's own evaluation is not overwritten
+    assert json.loads(other.read_text())["policy"].endswith(first)
+    assert json.loads(other.read_text())["safety"]["mode"] == "none"
+    assert json.loads((target / "eval.json").read_text()) == result
+    code, output = program(evaluate.main, f"run={folder}", "checkpoint=missing.pt")
+    assert code == 1
+    assert "missing.pt does not exist" in " ".join(output.split())
+
     files = set(folder.rglob("*"))
     code, output = program(evaluate.main, f"run={folder}", "env.n_agents=5")
     assert code == 1
