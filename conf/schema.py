@@ -30,7 +30,7 @@ class CollectorConfig:
     """Worlds stepped in parallel, 1..1e6."""
     steps_per_batch: int = 1
     """Vector steps between updates, 1..1e5."""
-    total_frames: int = 1_024_000
+    total_frames: int = 832_000
     """World-steps of the whole run; a multiple of num_envs * steps_per_batch."""
 
     def __post_init__(self) -> None:
