@@ -38,7 +38,7 @@ def test_step(n_agents, num_envs):
         "paper": SafetyConfig(composition="min", split="full", sampled_data=False),
         "stacked": SafetyConfig(),
     }
-    td = make_controller("random", world)(env.reset())
+    td = SafetyFilter(filters["none"], world)(make_controller("random", world)(env.reset()))
     print(f"\nN={n_agents} B={num_envs} threads={torch.get_num_threads()}")
     step = median_ms(lambda: env.step(td.clone()))
     print(f"  world step, coverage, observation  {step:8.2f} ms  {num_envs / step:8.1f} k world-steps/s")
@@ -72,7 +72,8 @@ def test_update():
     actor = make_actor(env.n_observation, world, agent)
     critic = make_critic(env.n_observation, world, agent)
     _, explore = make_policies(actor, world, safety, agent, 0, torch.device("cpu"))
-    batch = to_transitions(env.rollout(1, explore))
+    with torch.no_grad():
+        batch = to_transitions(env.rollout(1, explore))
     print()
     for in_loss in (False, True):
         loss, updater = make_loss(actor, critic, agent, SafetyConfig(in_loss=in_loss), world)
