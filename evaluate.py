@@ -23,7 +23,7 @@ from agents.evaluation import evaluate_policy
 from agents.networks import make_actor
 from agents.pipeline import pick_device
 from conf.callbacks import one_clear_error
-from conf.schema import EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
+from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
@@ -39,21 +39,20 @@ def main(cfg: DictConfig) -> None:
     """One evaluation."""
     config: EvaluateConfig = to_config(cfg)
     device = pick_device(config.device)
-    world: SurveillanceConfig = config.env
-    safety: SafetyConfig = config.safety
     folder = Path(HydraConfig.get().runtime.output_dir)
-    checkpoint = None
     env_seed, controller_seed = np.random.SeedSequence(config.seed).generate_state(2).tolist()
-    if config.run is not None:
-        trained = run_config(cfg, list(HydraConfig.get().overrides.task))
-        world, safety = trained.env, trained.safety
-        env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
-        nominal = make_actor(env.n_observation, world, trained.agent).to(device)
-        checkpoint = find_checkpoint(Path(config.run), config.checkpoint)
+    source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
+    world: SurveillanceConfig = source.env
+    safety: SafetyConfig = source.safety
+    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
+    if isinstance(source, Config):
+        checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
+        nominal = make_actor(env.n_observation, world, source.agent).to(device)
         nominal.load_state_dict(load_checkpoint(checkpoint, device)["actor"])
+        name = str(checkpoint)
     else:
-        env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
-        nominal = make_controller(config.controller or "", world, seed=controller_seed)
+        name = config.controller or ""
+        nominal = make_controller(name, world, seed=controller_seed)
     policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
     steps = config.steps or rollout_steps(world.horizon)
     metrics, statistics, trajectory = evaluate_policy(env, policy, steps, record=config.pictures)
@@ -63,7 +62,7 @@ def main(cfg: DictConfig) -> None:
         "steps": steps,
         "num_envs": config.num_envs,
         "seed": config.seed,
-        "policy": config.controller or str(checkpoint),
+        "policy": name,
         "git_hash": git_hash(),
         "env": asdict(world),
         "safety": asdict(safety),

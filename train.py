@@ -24,7 +24,7 @@ from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
-from conf.schema import Config, config_hash, register, rollout_steps, to_config, world_sizes, write_json
+from conf.schema import Config, config_hash, finished_run, register, rollout_steps, to_config, world_sizes, write_json
 from conf.versions import git_hash, package_versions
 from envs import SurveillanceEnv
 from envs.rendering import save_training_curve
@@ -39,8 +39,8 @@ def main(cfg: DictConfig) -> None:
     """One run: its folder is Hydra's run folder."""
     config: Config = to_config(cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if config.resume == "auto" and (folder / "summary.json").is_file():
-        tqdm.write(f"{folder} holds a finished run: nothing to do. resume=never trains it anew.")
+    if message := finished_run(folder, config.resume):  # a job of a multirun; single runs end before they get here
+        tqdm.write(message)
         return
     set_aside(folder)
 

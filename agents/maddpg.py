@@ -78,6 +78,15 @@ class MADDPGLoss(DDPGLoss):
         return loss, {}
 
 
+def check_penalty(agent: AgentConfig, safety: SafetyConfig) -> None:
+    """Raise a ``ValueError`` if a correction penalty is asked for while the loss does not contain the filter."""
+    if agent.correction_penalty and not safety.in_loss:
+        raise ValueError(
+            f"agent.correction_penalty={agent.correction_penalty} needs the filter inside the loss: "
+            "set safety.in_loss=true, or the penalty to 0."
+        )
+
+
 def make_loss(
     actor: TensorDictModule,
     critic: TensorDictSequential,
@@ -93,10 +102,7 @@ def make_loss(
     Raises:
         ValueError: if a correction penalty is asked for without ``safety.in_loss``.
     """
-    if agent.correction_penalty and not safety.in_loss:
-        raise ValueError(
-            f"agent.correction_penalty={agent.correction_penalty} needs the filter inside the loss: set safety.in_loss=true or 0."
-        )
+    check_penalty(agent, safety)
     if safety.in_loss:
         executed: TensorDictModuleBase = SafetyFilter(safety, world)
     else:

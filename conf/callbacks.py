@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from agents.checkpoint import CheckpointError
 from agents.maddpg import DivergedError
-from conf.schema import check_evaluation, to_config
+from conf.schema import check_evaluation, finished_run, to_config
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 EXPECTED_IN_RUN = (
@@ -54,9 +54,9 @@ class ValidateConfig(Callback):
                 traceback.print_exception(error)
                 sys.exit(1)
             fail(error)
-        folder = Path(str(config.hydra.run.dir))
-        if config.get("resume") == "auto" and (folder / "summary.json").is_file():
-            sys.stderr.write(f"{folder} holds a finished run: nothing to do. resume=never trains it anew.\n")
+        message = finished_run(Path(str(config.hydra.run.dir)), config.get("resume"))
+        if message:  # before Hydra rewrites .hydra/
+            sys.stderr.write(message + "\n")
             sys.exit(0)
 
 

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from agents import AgentConfig
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint
 from agents.controllers import CONTROLLERS
+from agents.maddpg import check_penalty
 from agents.pipeline import pick_device
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
@@ -151,11 +152,7 @@ class Config:
         if self.compile:
             raise ValueError("compile=true is not available yet: use compile=false.")
         self.safety.gains(self.env)
-        if self.agent.correction_penalty and not self.safety.in_loss:
-            raise ValueError(
-                f"agent.correction_penalty={self.agent.correction_penalty} needs the filter inside the loss: "
-                "set safety.in_loss=true, or the penalty to 0."
-            )
+        check_penalty(self.agent, self.safety)
 
 
 @dataclass
@@ -281,13 +278,21 @@ def evaluation_folder(cfg: DictConfig) -> str:
     changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in ("env", "safety", "checkpoint")]
     if cfg.run is not None:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
-        return f"{cfg.run}/eval/{name}{suffix}"
-    return f"runs/controllers/{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
+        return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
+    folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
+    return str(Path("runs/controllers").absolute() / folder)
 
 
 def rollout_steps(horizon: int) -> int:
     """Length of an evaluation that gives none: one episode, or 1000 steps where episodes do not end."""
     return horizon or 1000
+
+
+def finished_run(folder: Path, resume: str | None) -> str | None:
+    """What to tell the user if ``folder`` holds a finished run that is to be left alone; None otherwise."""
+    if resume != "auto" or not (folder / "summary.json").is_file():
+        return None
+    return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
 
 
 def write_json(path: Path, content: dict) -> None:

@@ -1,7 +1,7 @@
 """The world's parameters: one dataclass with a default, a unit and a range for every field, validated when it is built."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -339,6 +339,3 @@ def _is_table(rows: Any, widths: tuple[int, ...]) -> bool:
 
 def _rounded(row: list[float]) -> list[float]:
     return [round(x, 4) for x in row]
-
-
-WORLD_FIELDS = tuple(f.name for f in fields(SurveillanceConfig))

@@ -33,6 +33,12 @@ def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
     return position + dt * velocity
 
 
+def other_indices(n_agents: int, device: torch.device | None = None) -> Tensor:
+    """Row i holds the other robots in cyclic order, ``i + 1, i + 2, ..``: ``(N, N - 1)`` int64."""
+    robots = torch.arange(n_agents, device=device)
+    return (robots.unsqueeze(-1) + robots[1:]) % n_agents
+
+
 def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)

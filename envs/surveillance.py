@@ -15,7 +15,7 @@ from envs.battery import charge, charging_field, power
 from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments
 from envs.density import Density
-from envs.dynamics import integrate, limit_speed
+from envs.dynamics import integrate, limit_speed, other_indices
 from envs.homing import reassign_slots
 from envs.metrics import violations
 from envs.starts import draw_starts
@@ -70,8 +70,7 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
-        others = torch.arange(config.n_agents).unsqueeze(-1) + torch.arange(1, config.n_agents)
-        self._others = (others % config.n_agents).to(device)  # (N, N-1): robots i+1, i+2, ..
+        self._others = other_indices(config.n_agents, device)
         docked = self.slots[: config.n_agents]
         # J_ref is J under the uniform density whatever the family, so it takes the uniform density's cell moment
         _, cell_moment = quadrature_points(config.bounds, config.quadrature_resolution)

@@ -23,7 +23,7 @@ from torch import Tensor
 from envs import keys
 from envs.battery import charging_field
 from envs.config import SurveillanceConfig
-from envs.dynamics import limit_speed, pair_indices
+from envs.dynamics import limit_speed, other_indices, pair_indices
 from safety.barriers import (
     BarrierRow,
     accepted_current,
@@ -278,7 +278,7 @@ class SafetyFilter(TensorDictModuleBase):
 def _without_self(rows: Tensor) -> Tensor:
     """Drop the diagonal of ``(*B, N, N, k)`` rows: ``(*B, N, N - 1, k)``."""
     n = rows.shape[-2]
-    others = (torch.arange(n, device=rows.device).unsqueeze(-1) + torch.arange(1, n, device=rows.device)) % n
+    others = other_indices(n, rows.device)
     return rows.gather(-2, others.unsqueeze(-1).expand(*rows.shape[:-3], n, n - 1, rows.shape[-1]))
 
 

@@ -143,6 +143,13 @@ def test_controller_evaluation_writes_its_own_folder(program, tmp_path):
     assert json.loads(result.read_text())["robot_steps"] == 60
 
 
+def test_a_sweep_of_controllers_writes_under_runs_only(program, tmp_path):
+    code, output = program(evaluate.main, "-m", "controller=random,lloyd", "steps=3", "num_envs=2", "pictures=false")
+    assert code == 0, output
+    assert len(list(tmp_path.glob("runs/controllers/*/eval.json"))) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
 def test_a_bad_job_of_a_multirun_leaves_the_others_alone(program, tmp_path):
     code, output = program(train.main, "-m", *TINY, "env.n_agents=2,0")
     assert code == 1
