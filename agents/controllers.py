@@ -2,71 +2,16 @@
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from agents.adversaries import ADVERSARIES, Random
+from agents.base import Controller
+from agents.patrol import Patrol
 from envs import SurveillanceConfig, keys
 from envs.coverage import coverage_cost, coverage_gradient, voronoi_moments
-from envs.density import Density
 from envs.dynamics import limit_speed
 from envs.homing import homing_velocity, reserve
 from safety import SafetyConfig, SafetyFilter
-
-
-class Controller(TensorDictModuleBase):
-    """Base of all controllers: a pure function of the states (and of an own generator for the random ones).
-
-    Args:
-        world: the world.
-        seed: seed of the controller's generator.
-    """
-
-    def __init__(self, world: SurveillanceConfig, seed: int = 0) -> None:
-        super().__init__()
-        self.world = world
-        self.seed = seed
-        self.geometry = world.homing
-        self.in_keys = [keys.POSITION, keys.ENERGY, keys.SLOT]
-        self.out_keys = [keys.NOMINAL_ACTION]
-        self._on: dict[torch.device, tuple[Density, Tensor, torch.Generator]] = {}
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the nominal action."""
-        tensordict.set(keys.NOMINAL_ACTION, self.act(tensordict))
-        return tensordict
-
-    def act(self, tensordict: TensorDictBase) -> Tensor:
-        """Nominal action ``(*B, N, d)``, m/s."""
-        raise NotImplementedError
-
-    def tools(self, like: Tensor) -> tuple[Density, Tensor, torch.Generator]:
-        """Density, slots ``(S, d)`` and generator on the device of ``like``."""
-        if like.device not in self._on:
-            slots = torch.tensor(self.world.slot_positions, dtype=self.world.torch_dtype, device=like.device)
-            generator = torch.Generator(device=like.device).manual_seed(self.seed)
-            self._on[like.device] = (Density(self.world, like.device), slots, generator)
-        return self._on[like.device]
-
-    def weights(self, tensordict: TensorDictBase) -> tuple[Density, Tensor]:
-        """Density and the present weights of its quadrature points."""
-        position = tensordict[keys.POSITION]
-        density, _, _ = self.tools(position)
-        params = tensordict[keys.DENSITY] if density.n_params else position.new_zeros(*position.shape[:-2], 0)
-        return density, density.weights(params)
-
-
-class Random(Controller):
-    """Uniform in the speed ball, drawn anew each step."""
-
-    def act(self, tensordict: TensorDictBase) -> Tensor:
-        """See the class."""
-        position = tensordict[keys.POSITION]
-        _, _, generator = self.tools(position)
-        factory = {"generator": generator, "dtype": position.dtype, "device": position.device}
-        direction = torch.randn(position.shape, **factory)
-        direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-        share = torch.rand((*position.shape[:-1], 1), **factory) ** (1 / position.shape[-1])
-        return self.world.max_speed * share * direction
 
 
 class Lloyd(Controller):
@@ -137,7 +82,7 @@ class CoverageCBFLiteral(CoverageCBF):
 
     def __init__(self, world: SurveillanceConfig, seed: int = 0) -> None:
         super().__init__(world, seed)
-        self.rows = SafetyFilter(SafetyConfig(split="joint", sampled_data=False), world)
+        self.rows = SafetyFilter(SafetyConfig(mode="paper", split="joint", sampled_data=False), world)
 
     def act(self, tensordict: TensorDictBase) -> Tensor:
         """See the class."""
@@ -156,6 +101,8 @@ CONTROLLERS: dict[str, type[Controller]] = {
     "charge_when_low": ChargeWhenLow,
     "coverage_cbf": CoverageCBF,
     "coverage_cbf_literal": CoverageCBFLiteral,
+    "patrol": Patrol,
+    **ADVERSARIES,
 }
 
 

@@ -8,6 +8,8 @@ import torch
 
 from envs.battery import break_even_radius
 from envs.homing import HomingGeometry
+from envs.inequalities import check_inequalities, least_clearance
+from envs.layout import perimeter_docks, slot_ring
 
 DENSITIES = ("uniform", "gaussian_mixture", "moving", "age")
 MAX_AGENTS = 64
@@ -96,6 +98,8 @@ class SurveillanceConfig:
     """Reserve family rho: linear (drive home at homing_speed) | logarithmic (exponential approach; needs more reserve)."""
     homing_speed: float = 0.98
     """Speed v of driving home as a share of max_speed, (0, 1)."""
+    homing_clearance: float = 0.0
+    """Distance Delta_G that two robots on their way home must keep, m, [0, 10]; 0 = the least that will do."""
     reassign_slots: bool = True
     """Exchange slots between robots after a transition where the new state stays certified."""
     reset_clearance: float = 0.0
@@ -111,7 +115,7 @@ class SurveillanceConfig:
         """Check every field and every combination that the world itself needs."""
         self._check_fields()
         self._check_layout()
-        self._check_physics()
+        check_inequalities(self)
 
     # ---- derived values -------------------------------------------------------------------------------------------
     @property
@@ -138,7 +142,8 @@ class SurveillanceConfig:
     @property
     def station_positions(self) -> list[list[float]]:
         """Station centres, M rows of d coordinates, m."""
-        return self._complete(self.stations, floor=True) if self.stations else self._perimeter_stations()
+        rows = self.stations or perimeter_docks(self.bounds, self.n_agents)
+        return self._complete(rows, floor=True)
 
     @property
     def slot_positions(self) -> list[list[float]]:
@@ -148,9 +153,7 @@ class SurveillanceConfig:
         stations = self.station_positions
         if self.slots == 1:
             return stations
-        ring = [2 * math.pi * k / self.slots for k in range(self.slots)]
-        radius = self.slot_radius
-        return [[s[0] + radius * math.cos(a), s[1] + radius * math.sin(a), *s[2:]] for s in stations for a in ring]
+        return [slot for station in stations for slot in slot_ring(station, self.slots, self.slot_radius)]
 
     @property
     def density_center_positions(self) -> list[list[float]]:
@@ -176,8 +179,7 @@ class SurveillanceConfig:
 
     @property
     def homing(self) -> HomingGeometry:
-        """Constants of driving home (SAFETY.md section 1 to 4), derived from the fields."""
-        step = self.max_speed * self.dt
+        """Constants of driving home (docs/safety.md), derived from the fields."""
         offset = max(min(math.dist(slot, s) for s in self.station_positions) for slot in self.slot_positions)
         charge_radius = self.break_even_radius - offset
         speed = self.homing_speed * self.max_speed
@@ -188,7 +190,9 @@ class SurveillanceConfig:
         steps_home = (
             math.ceil(self.diameter / (speed * self.dt)) if linear else math.ceil(-math.log(unit) / (gain * self.dt))
         )
-        energy_scale = self.energy_max + self.max_drain_rate * (self.diameter + reach) / speed
+        # the logarithmic reserve is steepest at its end, where a rounding of the position weighs most
+        steepest = 1.0 if linear else max(1.0, self.diameter / max(charge_radius, 1e-9))
+        energy_scale = self.energy_max + self.max_drain_rate * (self.diameter + reach * steepest) / speed
         eps_energy = max(1e-4 * (self.energy_max - self.energy_min), 4 * steps_home * unit * energy_scale)
         eps_distance = max(5e-3 * self.safety_distance, 8 * steps_home * unit * reach)
         return HomingGeometry(
@@ -199,7 +203,7 @@ class SurveillanceConfig:
             dt=self.dt,
             charge_radius=charge_radius,
             reserve_radius=charge_radius - speed * self.dt if linear else charge_radius * (1 - gain * self.dt),
-            clearance=math.hypot(self.safety_distance + eps_distance, 2 * step),
+            clearance=self.homing_clearance or least_clearance(self, eps_distance),
             energy_min=self.energy_min,
             energy_max=self.energy_max,
             eps_energy=eps_energy,
@@ -245,6 +249,7 @@ class SurveillanceConfig:
         check_choice("env.on_violation", self.on_violation, ("terminate", "continue"))
         check_choice("env.reserve", self.reserve, ("linear", "logarithmic"))
         check_range("env.homing_speed", self.homing_speed, 0, 0.9999, open_low=True)
+        check_range("env.homing_clearance", self.homing_clearance, 0, 10, hint="0 chooses the least that will do.")
         check_range("env.reset_clearance", self.reset_clearance, 0, 10)
         check_range("env.reset_reserve", self.reset_reserve, 0, 0.99)
         check_choice("env.dtype", self.dtype, ("float32", "float64"))
@@ -265,66 +270,10 @@ class SurveillanceConfig:
                 )
         if not self.density_centers:
             raise ValueError("env.density_centers=[] is empty: give at least one centre.")
-        slots = self.slot_positions
-        if len(slots) < self.n_agents:
-            raise ValueError(
-                f"env.stations, env.slots: {len(slots)} slots for env.n_agents={self.n_agents} robots, every robot needs its own. "
-                "Add stations, raise env.slots, or leave env.stations=[] for one station per robot."
-            )
-        for slot in slots:
-            if any(not low <= x <= high for x, (low, high) in zip(slot, self.bounds, strict=True)):
-                raise ValueError(
-                    f"env.slots: slot {_rounded(slot)} is outside env.arena={self.bounds}. Move its station inwards."
-                )
-        needed = self.homing.clearance + self.homing.eps_distance
-        for i, a in enumerate(slots):
-            for b in slots[:i]:
-                if math.dist(a, b) <= needed:
-                    raise ValueError(
-                        f"env.stations, env.slots: slots {_rounded(b)} and {_rounded(a)} overlap: {math.dist(a, b):.4g} m apart, "
-                        f"two docked robots need more than {needed:.4g} m. Move stations apart or raise env.slot_radius."
-                    )
-
-    def _check_physics(self) -> None:
-        if self.charge_rate <= self.max_drain_rate:
-            raise ValueError(
-                f"env.charge_rate={self.charge_rate} must exceed the drain at full speed, {self.max_drain_rate:.4g}: "
-                "a robot could never charge."
-            )
-        homing, step = self.homing, self.max_speed * self.dt
-        if homing.reserve_radius < 2 * step:
-            raise ValueError(
-                f"env.charge_radius={self.charge_radius}: the reserve must end {2 * step:.4g} m or more from the slot (two steps "
-                f"at full speed), it ends at {homing.reserve_radius:.4g} m. Enlarge env.charge_radius, shorten env.dt or lower "
-                "env.max_speed."
-            )
-        needed = 3 * homing.eps_energy + self.max_drain_rate * self.dt
-        if self.energy_max - self.energy_min <= needed:
-            raise ValueError(
-                f"env.energy_max - env.energy_min = {self.energy_max - self.energy_min:.4g} must exceed {needed:.4g} "
-                "(one step's drain and the rounding margins)."
-            )
 
     def _complete(self, rows: list[list[float]], *, floor: bool) -> list[list[float]]:
         fill = [low if floor else (low + high) / 2 for low, high in self.bounds]
         return [[float(x) for x in row] + fill[len(row) :] for row in rows]
-
-    def _perimeter_stations(self) -> list[list[float]]:
-        """One station per robot, evenly along the walls (inset by 5 % of the shorter side), on the floor in 3-D."""
-        (x0, x1), (y0, y1) = self.bounds[:2]
-        inset = 0.05 * min(x1 - x0, y1 - y0)
-        x0, x1, y0, y1 = x0 + inset, x1 - inset, y0 + inset, y1 - inset
-        width, height = x1 - x0, y1 - y0
-        corners = [(0.0, x0, y0), (width, x1, y0), (width + height, x1, y1), (2 * width + height, x0, y1)]
-        length = 2 * (width + height)
-        rows = []
-        for k in range(self.n_agents):
-            s = (width / 2 + k * length / self.n_agents) % length
-            start, x, y = max(c for c in corners if c[0] <= s)
-            along = s - start
-            dx, dy = {0: (1, 0), 1: (0, 1), 2: (-1, 0), 3: (0, -1)}[[c[0] for c in corners].index(start)]
-            rows.append([x + dx * along, y + dy * along])
-        return self._complete(rows, floor=True)
 
 
 def _is_table(rows: Any, widths: tuple[int, ...]) -> bool:
@@ -335,7 +284,3 @@ def _is_table(rows: Any, widths: tuple[int, ...]) -> bool:
         and all(isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in row)
         for row in rows
     )
-
-
-def _rounded(row: list[float]) -> list[float]:
-    return [round(x, 4) for x in row]

@@ -12,12 +12,15 @@ approach ``G`` of the exact piecewise linear paths is this project's (../docs/sa
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from envs.dynamics import pair_indices
+
+TINY = 1e-30  # below it a length is 0
 
 
 @dataclass(frozen=True)
@@ -89,15 +92,28 @@ def homing_velocity(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     if geometry.family == "logarithmic":
         return geometry.gain * offset
     distance = offset.norm(dim=-1, keepdim=True)
-    return offset * torch.clamp(geometry.speed / distance.clamp_min(1e-30), max=1 / geometry.dt)
+    return offset * torch.clamp(geometry.speed / distance.clamp_min(TINY), max=1 / geometry.dt)
+
+
+class ClosestMoment(NamedTuple):
+    """Where two homing robots come closest: what the gradient of the closest approach needs."""
+
+    distance: Tensor
+    """``G_ij (*B, P)``, m."""
+    relative: Tensor
+    """Relative position ``xi_i - xi_j`` at that moment, ``(*B, P, d)``, m."""
+    share: Tensor
+    """``l / D``: share of the way home still to go for i and j, ``(2, *B, P)``."""
+    slope: Tensor
+    """``dl / dD``: by how much the way to go grows with the distance at the start, for i and j, ``(2, *B, P)``."""
 
 
 def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> Tensor:
     """Exact minimum distance ``G_ij`` of every pair of robots while all drive home, between samples included.
 
     Linear family: the distance to go falls by ``v dt`` a step, and by what is left in the last one, so both paths are
-    linear between the sorted times ``{0, n_i, n_i + 1, n_j, n_j + 1}``, ``n = floor(D / (v dt))``: the minimum over
-    four point-to-segment distances. Logarithmic family: the difference of two robots moves on a straight segment.
+    linear between the times ``{0, n_i, n_i + 1, n_j, n_j + 1}``, ``n = floor(D / (v dt))``: the minimum over four
+    point-to-segment distances. Logarithmic family: the difference of two robots moves on a straight segment.
 
     Args:
         position: ``(*B, N, d)``, m.
@@ -107,36 +123,128 @@ def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGe
     Returns:
         ``(*B, P)``, m, pairs in ``torch.triu_indices`` order.
     """
-    i, j = pair_indices(position.shape[-2], position.device)
-    offset = position - slot_position
     if geometry.family == "logarithmic":
-        start = position[..., i, :] - position[..., j, :]
-        end = slot_position[..., i, :] - slot_position[..., j, :]
+        start, end = _relative_ends(position, slot_position)
         return segment_distance(start, end)
-    distance = offset.norm(dim=-1)
-    direction = offset / distance.clamp_min(1e-30).unsqueeze(-1)
+    *_, relative = _relative_path(position, slot_position, geometry)
+    _, squared = _nearest_on_segments(relative)
+    return squared.amin(dim=0).sqrt()
+
+
+def closest_moment(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestMoment:
+    """The closest approach of every pair together with its moment; arguments as :func:`closest_approach`."""
+    if geometry.family == "logarithmic":
+        start, end = _relative_ends(position, slot_position)
+        along = end - start
+        t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(TINY)).clamp(0, 1)
+        relative = start + t.unsqueeze(-1) * along
+        share = (1 - t).expand(2, *t.shape)
+        return ClosestMoment(relative.norm(dim=-1), relative, share, share)
+    distance, whole, times, relative = _relative_path(position, slot_position, geometry)
+    t, squared = _nearest_on_segments(relative)
+    least, index = squared.min(dim=0, keepdim=True)
+    t = t.gather(0, index)
+    before, after = times.gather(0, index), times.gather(0, index + 1)
+    time = before + t * (after - before)
+    wide = index.unsqueeze(1).expand(-1, *relative.shape[1:])
+    start, end = relative.gather(0, wide).squeeze(0), relative.gather(0, wide + 1).squeeze(0)
+    to_go = _to_go(distance, whole, time, geometry)
+    slope = torch.where(time <= whole, 1.0, (whole + 1 - time).clamp_min(0))
+    share = torch.where(
+        distance > 0, to_go / distance.clamp_min(TINY), slope
+    )  # in the slot the last step's ratio stands
+    return ClosestMoment(least.squeeze(0).sqrt(), (start + t * (end - start)).movedim(0, -1), share, slope)
+
+
+def _relative_ends(position: Tensor, slot_position: Tensor) -> tuple[Tensor, Tensor]:
+    """Relative positions of all pairs now and in their slots, ``(*B, P, d)`` each."""
+    i, j = pair_indices(position.shape[-2], position.device)
+    return position[..., i, :] - position[..., j, :], slot_position[..., i, :] - slot_position[..., j, :]
+
+
+def _relative_path(
+    position: Tensor, slot_position: Tensor, geometry: HomingGeometry
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Corners of the relative homing path of every pair (linear family).
+
+    Returns:
+        Distance to the slot ``D (2, *B, P)`` and whole steps ``n (2, *B, P)`` of i and j, times ``(5, *B, P)`` in
+        steps, relative positions ``(5, d, *B, P)``: leading dimensions first, as sums over long runs are fast.
+    """
+    pair = torch.stack(pair_indices(position.shape[-2], position.device))  # (2, P)
+    offset = (position - slot_position).movedim(-1, 0)
+    distance = offset.square().sum(0).sqrt()
+    direction = (offset / distance.clamp_min(TINY))[..., pair].movedim(-2, 1)  # (d, 2, *B, P)
+    slot = slot_position.movedim(-1, 0)[..., pair].movedim(-2, 1)
+    distance = distance[..., pair].movedim(-2, 0)  # (2, *B, P)
+    whole = (distance / (geometry.speed * geometry.dt)).floor()
+    first, last = whole.amin(dim=0), whole.amax(dim=0)
+    times = torch.stack([torch.zeros_like(first), first, first + 1, torch.maximum(last, first + 1), last + 1])
+    to_go = _to_go(distance, whole, times.unsqueeze(1), geometry)  # (5, 2, *B, P)
+    path = slot + direction * to_go.unsqueeze(1)  # (5, d, 2, *B, P)
+    return distance, whole, times, path[:, :, 0] - path[:, :, 1]
+
+
+def _to_go(distance: Tensor, whole: Tensor, times: Tensor, geometry: HomingGeometry) -> Tensor:
+    """Distance to the slot at ``times``, in steps, under the backup motion."""
     step = geometry.speed * geometry.dt
-    whole = (distance / step).floor()
-    zero = torch.zeros_like(whole[..., i])
-    times, _ = torch.stack([zero, whole[..., i], whole[..., i] + 1, whole[..., j], whole[..., j] + 1], dim=-1).sort(
-        dim=-1
-    )
+    last_step = (distance - whole * step) * (whole + 1 - times)
+    return torch.where(times <= whole, distance - times * step, last_step).clamp_min(0)
 
-    def path(robot: Tensor) -> Tensor:
-        """Position of ``robot`` at ``times``, ``(*B, P, 5, d)``."""
-        d, n = distance[..., robot, None], whole[..., robot, None]
-        to_go = torch.where(times <= n, d - times * step, (d - n * step) * (n + 1 - times)).clamp_min(0)
-        return slot_position[..., robot, None, :] + direction[..., robot, None, :] * to_go.unsqueeze(-1)
 
-    relative = path(i) - path(j)
-    return segment_distance(relative[..., :-1, :], relative[..., 1:, :]).amin(dim=-1)
+def _nearest_on_segments(corners: Tensor) -> tuple[Tensor, Tensor]:
+    """Nearest points to 0 of the segments between successive corners ``(K, d, ...)``: place in [0, 1] and square."""
+    start = corners[:-1]
+    along = corners[1:] - start
+    t = (-(start * along).sum(1) / along.square().sum(1).clamp_min(TINY)).clamp(0, 1)
+    return t, (start + t.unsqueeze(1) * along).square().sum(1)
 
 
 def segment_distance(start: Tensor, end: Tensor) -> Tensor:
     """Distance of the origin to the segment from ``start`` to ``end``, ``(..., d), (..., d) -> (...)``."""
     along = end - start
-    t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(1e-30)).clamp(0, 1)
+    t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(TINY)).clamp(0, 1)
     return (start + t.unsqueeze(-1) * along).norm(dim=-1)
+
+
+def certified_robots(
+    position: Tensor, energy: Tensor, slot_position: Tensor, geometry: HomingGeometry, bounds: Tensor, *, margins: int
+) -> Tensor:
+    """Which robots satisfy their own part of the certified set, with ``margins`` rounding margins.
+
+    Two margins are demanded on entry (start states, slot reassignment, rows of a filter), one of the states that a
+    filter's shield accepts, none of a state that is still called certified: each step may lose a few roundings.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        energy: ``(*B, N)``.
+        slot_position: ``(*B, N, d)``, m.
+        geometry: constants of the backup motion.
+        bounds: ``(d, 2)``, the arena, m.
+        margins: 0, 1 or 2.
+
+    Returns:
+        ``(*B, N)`` bool; NaN fails.
+    """
+    distance = (position - slot_position).square().sum(-1).sqrt()
+    spare = energy - geometry.energy_min - margins * geometry.eps_energy - reserve(distance, geometry)
+    wall = (3 - margins) / 2 * geometry.eps_distance  # a robot at the wall must not leave the set by one rounding
+    inside = ((position >= bounds[:, 0] - wall) & (position <= bounds[:, 1] + wall)).all(dim=-1)
+    return (spare >= 0) & (energy <= geometry.energy_max) & inside
+
+
+def certified_pairs(closest: Tensor, geometry: HomingGeometry, *, margins: int) -> Tensor:
+    """Which pairs, given their closest approach ``(*B, P)`` in m, satisfy theirs; margins as :func:`certified_robots`."""
+    return closest >= geometry.clearance + (margins - 1) * geometry.eps_distance
+
+
+def certified_parts(
+    position: Tensor, energy: Tensor, slot_position: Tensor, geometry: HomingGeometry, bounds: Tensor, *, margins: int
+) -> tuple[Tensor, Tensor]:
+    """:func:`certified_robots` ``(*B, N)`` and :func:`certified_pairs` ``(*B, P)`` of a state."""
+    robots = certified_robots(position, energy, slot_position, geometry, bounds, margins=margins)
+    closest = closest_approach(position, slot_position, geometry)
+    return robots, certified_pairs(closest, geometry, margins=margins)
 
 
 def is_certified(
@@ -161,14 +269,9 @@ def is_certified(
     Returns:
         ``(*B,)`` bool.
     """
-    distance = (position - slot_position).norm(dim=-1)
-    margin = energy - geometry.energy_min - 2 * geometry.eps_energy - reserve(distance, geometry)
-    inside = ((position >= bounds[:, 0]) & (position <= bounds[:, 1])).all(dim=-1)
-    robots = ((margin >= 0) & (energy <= geometry.energy_max) & inside).all(dim=-1)
-    apart = (
-        closest_approach(position, slot_position, geometry) >= geometry.clearance + geometry.eps_distance + clearance
-    )
-    return robots & apart.all(dim=-1)
+    geometry = replace(geometry, clearance=geometry.clearance + clearance)
+    robots, pairs = certified_parts(position, energy, slot_position, geometry, bounds, margins=2)
+    return robots.all(dim=-1) & pairs.all(dim=-1)
 
 
 def exchange_slots(position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor, geometry: HomingGeometry) -> Tensor:
@@ -222,5 +325,7 @@ def reassign_slots(
         ``(*B, N)`` int64, one-to-one.
     """
     candidate = exchange_slots(position, energy, slot, slots, geometry)
-    adopt = is_certified(position, energy, slots[candidate], geometry, bounds)
-    return torch.where(adopt.unsqueeze(-1), candidate, slot)
+    changed = (candidate != slot).any(dim=-1)
+    some = changed.nonzero(as_tuple=True)  # few worlds exchange in a step: the certificate of the others is not needed
+    adopt = is_certified(position[some], energy[some], slots[candidate[some]], geometry, bounds)
+    return slot.index_put(some, torch.where(adopt.unsqueeze(-1), candidate[some], slot[some]))

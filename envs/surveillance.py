@@ -11,14 +11,14 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs import keys
-from envs.battery import charge, charging_field, power
 from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments
 from envs.density import Density
-from envs.dynamics import integrate, limit_speed, other_indices
+from envs.dynamics import limit_speed, other_indices
 from envs.homing import reassign_slots
 from envs.metrics import violations
 from envs.starts import draw_starts
+from envs.transition import transition
 
 
 class SurveillanceEnv(EnvBase):
@@ -184,16 +184,7 @@ class SurveillanceEnv(EnvBase):
         Returns:
             ``(B, N, d)`` and ``(B, N)``.
         """
-        c = self.config
-        field = charging_field(position, self.stations, full_radius=c.charge_radius_full, zero_radius=c.charge_radius)
-        drain = power(
-            velocity.norm(dim=-1),
-            drain_rate=c.drain_rate,
-            per_speed=c.drain_per_speed,
-            per_speed_squared=c.drain_per_speed_squared,
-        )
-        next_energy = charge(energy, field, current, drain, charge_rate=c.charge_rate, dt=c.dt)
-        return integrate(position, velocity, c.dt), next_energy
+        return transition(position, energy, velocity, current, self.stations, self.config)
 
     # ---- start states ----------------------------------------------------------------------------------------------
     def _write_start(self, mask: Tensor) -> None:

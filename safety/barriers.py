@@ -110,12 +110,14 @@ def sampled_energy_row(
     floor = geometry.energy_min + 2 * geometry.eps_energy
     value = energy - floor - reserve(distance, geometry)
     if geometry.family == "linear":
-        cautious = (step - geometry.speed * geometry.dt) * geometry.drain_rate / (geometry.speed * geometry.eps_energy)
+        cautious = (
+            (step - geometry.speed * geometry.dt) * geometry.drain_rate / (2 * geometry.speed * geometry.eps_energy)
+        )
     else:
-        # D (1 - k dt) (1 - exp(-k~ g eps / K_d)) <= U - k dt D at the farthest D, the arena's diagonal v / k
+        # D (1 - k dt) (1 - exp(-k~ g 2 eps / K_d)) <= U - k dt D at the farthest D, the arena's diagonal v / k
         farthest = geometry.speed / geometry.gain * (1 - geometry.gain * geometry.dt)
         spare_step = (step - geometry.speed * geometry.dt) / farthest
-        cautious = -geometry.drain_rate / (geometry.decay * geometry.eps_energy) * math.log1p(-spare_step)
+        cautious = -geometry.drain_rate / (2 * geometry.decay * geometry.eps_energy) * math.log1p(-spare_step)
     kept = 1 - torch.where(value < 0, min(gain, cautious), gain)
     spare = next_energy - floor - kept * value
     if geometry.family == "linear":

@@ -1,19 +1,21 @@
 """The safety filter: nominal action in, executed action out.
 
-Per robot (split=half|full) or per world (split=joint):
+Per robot, or per world with split=joint:
 
     min ||u - u^||^2   s.t.   L_F h + L_G h (u, c) >= -alpha h  for the barriers' rows,   ||u|| <= max_speed,
 
 with the accepted current ``c`` in closed form (nominal current 1; more current never hurts survivability). No row is
 ever relaxed: a problem without solution, or one the solver could not solve to its tolerance, falls to **hold**
-(``u = 0``), is flagged in ("filter", "status") and counted in ("filter", "level") = 1. The nominal action is never
-executed unfiltered. What this filter does not promise: its rows are the literature's, so holding, another robot or the
-length of a step can still lead to a violation; the environment counts those.
+(``u = 0``) and is flagged in ("filter", "status"). The nominal action is never executed unfiltered.
+
+* ``mode=certified``: rows and shield of :mod:`safety.certificate`. From a certified state the next state is certified,
+  whatever the nominal action and the solver: ("filter", "level") tells who decided, 0 the program, 1 hold, 2 homing.
+* ``mode=paper``: the rows are the literature's and hold is the last resort, so holding, another robot or the length of a
+  step can still lead to a violation; the environment counts those.
 """
 
 import dataclasses
-import math
-from functools import lru_cache
+import functools
 
 import torch
 from tensordict import TensorDictBase
@@ -21,9 +23,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from envs import keys
-from envs.battery import charging_field
+from envs.battery import charge, charging_field
 from envs.config import SurveillanceConfig
 from envs.dynamics import limit_speed, other_indices, pair_indices
+from envs.transition import transition
 from safety.barriers import (
     BarrierRow,
     accepted_current,
@@ -32,11 +35,10 @@ from safety.barriers import (
     overcharge_barrier,
     sampled_energy_row,
 )
+from safety.certificate import HOLD, HOMING, certified_rows, outside, pair_minimum, shield
 from safety.config import SafetyConfig
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
-
-POLYGON_FACES = 16  # 2-D speed limit of solvers without a ball: an inscribed regular polygon
-POLYHEDRON_FACES = 64  # 3-D: inscribed polyhedron with spiral face normals
+from safety.speed_faces import speed_faces
 
 
 class SafetyFilter(TensorDictModuleBase):
@@ -47,7 +49,9 @@ class SafetyFilter(TensorDictModuleBase):
     * in: nominal_action ``(*B, N, d)`` m/s, position ``(*B, N, d)`` m, energy ``(*B, N, 1)``, slot ``(*B, N, 1)`` int64.
     * out: action ``(*B, N, d)`` m/s in the speed ball, charge_current ``(*B, N, 1)`` in [0, 1], correction
       ``(*B, N, 1)`` = ||u - u^|| with u^ first cut to the speed ball, status and level ``(*B, N)`` int64, residual
-      and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``.
+      and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``, outside ``(*B, N)`` bool: a state that
+      the filter makes no promise for (certified: not in the certified set, the robot drives home; paper: a barrier is
+      negative). certified also writes h_g = G - Delta_G (smallest over the pairs) ``(*B, N, 1)``.
 
     A non-finite nominal action is replaced by hold, flagged INACCURATE and counted, as a correction of max_speed.
 
@@ -71,9 +75,11 @@ class SafetyFilter(TensorDictModuleBase):
         self.in_keys = [keys.NOMINAL_ACTION, keys.POSITION, keys.ENERGY, keys.SLOT]
         self.out_keys = [
             *(keys.ACTION, keys.CHARGE_CURRENT, keys.CORRECTION, keys.STATUS, keys.LEVEL, keys.RESIDUAL),
-            *(keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION),
+            *(keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION, keys.OUTSIDE),
         ]
-        self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+        if safety.mode == "certified":
+            self.out_keys.append(keys.BARRIER_CERTIFICATE)
+        self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Filter the nominal action of ``tensordict`` and write the results into it."""
@@ -101,15 +107,22 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             The tensors of ``out_keys``.
         """
-        h_c, h_o, h_s = self._barriers(position, energy, slot)
+        field = self._field(position)
+        h_c, h_o, h_s = self._barriers(position, energy, slot, field)
         cut = limit_speed(nominal, self.world.max_speed)
         finite = nominal.isfinite().all(dim=-1)
+        target = torch.where(finite.unsqueeze(-1), cut, 0.0)
+        values = [h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value.amin(dim=-1, keepdim=True)]
+        beyond = ~(torch.cat(values, dim=-1) >= 0).all(dim=-1)
         if self.safety.mode == "none":
             action, current = cut, torch.ones_like(energy)
             status = level = torch.zeros_like(slot)
             residual = torch.zeros_like(energy)
+        elif self.safety.mode == "certified":
+            action, current, status, residual, level, beyond, gap = self._certified(
+                target, finite, position, energy, slot, field, h_o
+            )
         else:
-            target = torch.where(finite.unsqueeze(-1), cut, 0.0)
             action, current, status, residual = self._program(target, position, energy, slot, h_c, h_o, h_s)
             status = torch.where(finite, status, int(QPStatus.INACCURATE))
             hold = status != QPStatus.SOLVED
@@ -120,10 +133,60 @@ class SafetyFilter(TensorDictModuleBase):
         squared = difference.square().sum(-1, keepdim=True)
         correction = torch.where(squared > 0, squared.clamp_min(torch.finfo(squared.dtype).tiny).sqrt(), 0.0)
         correction = torch.where(finite.unsqueeze(-1), correction, self.world.max_speed)
+        certificate = (gap.unsqueeze(-1),) if self.safety.mode == "certified" else ()
         return (
             *(action, current.unsqueeze(-1), correction, status, level, residual.unsqueeze(-1)),
-            *(h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value.amin(dim=-1, keepdim=True)),
+            *values,
+            beyond,
+            *certificate,
         )
+
+    def _certified(
+        self,
+        target: Tensor,
+        finite: Tensor,
+        position: Tensor,
+        energy: Tensor,
+        slot: Tensor,
+        field: Tensor,
+        h_o: BarrierRow,
+    ) -> tuple[Tensor, ...]:
+        """Programs and shield: ``(action, current, status, residual, level, outside, G - Delta_G)``."""
+        world, geometry, shape = self.world, self.geometry, target.shape
+        stations, slots, bounds = self._layout(position)
+        step = functools.partial(transition, stations=stations, config=world)
+        current, _ = accepted_current(h_o._replace(value=h_o.value - geometry.eps_energy), self.gains.overcharge)
+        # standing still drains least: no action may lift the energy over its limit, not even by a rounding
+        rest = torch.full_like(energy, world.drain_rate)
+        fullest = charge(energy, field, current, rest, charge_rate=world.charge_rate, dt=world.dt)
+        current = torch.where(fullest > world.energy_max, 0.0, current)
+        next_energy = energy + world.dt * (world.charge_rate * field * current - geometry.drain_rate)
+        flat = [x.reshape(-1, *shape[-2:]) for x in (target, position, slots[slot])]
+        flat += [x.reshape(-1, shape[-2]) for x in (energy, next_energy, current, finite)]
+        target, position, home, energy, next_energy, flat_current, finite = flat
+        _, normal, bound = sampled_energy_row(
+            *(position, energy, next_energy, home, geometry),
+            gain=self.gains.energy * world.dt,
+            step=world.max_speed * world.dt,
+        )
+        rows = certified_rows(
+            *(position, home, normal, bound, bounds, geometry, self.gains),
+            safety_distance=world.safety_distance,
+            max_speed=world.max_speed,
+            anchored=self.safety.split != "half",
+        )
+        action, status, residual = self._solve_per_robot(target, rows.G, rows.h)
+        status = torch.where(finite, status, int(QPStatus.INACCURATE))
+        beyond = outside(position, energy, home, rows.closest, geometry, bounds)
+        level = torch.where(status == QPStatus.SOLVED, 0, HOLD)
+        level = torch.where(beyond, HOMING, level)
+        action, level, _ = shield(
+            *(step, position, energy, home, action, flat_current, level, rows.closest, geometry, bounds),
+            max_speed=world.max_speed,
+        )
+        gap = pair_minimum(rows.closest, shape[-2]) - geometry.clearance
+        per_robot = (x.reshape(shape[:-1]) for x in (status, residual, level, beyond, gap))
+        return action.reshape(shape), current, *per_robot
 
     def _program(
         self,
@@ -136,7 +199,7 @@ class SafetyFilter(TensorDictModuleBase):
         h_s: BarrierRow,
     ) -> tuple[Tensor, ...]:
         """Rows, current and solution: ``(action, current, status, residual)``."""
-        alpha_c, alpha_o, alpha_s = self.gains
+        alpha_c, alpha_o, alpha_s, _ = self.gains
         if self.safety.sampled_data:
             # one rounding margin: a robot that stays docked approaches E_max to the last bit
             h_o = h_o._replace(value=h_o.value - self.geometry.eps_energy)
@@ -153,7 +216,7 @@ class SafetyFilter(TensorDictModuleBase):
         if self.safety.sampled_data:
             # the robot may drain at full power whatever it does, so its next energy is bounded by that
             next_energy = energy + self.world.dt * (h_c.drift + h_c.current_gain * current)
-            _, slots = self._layout(position)
+            _, slots, _ = self._layout(position)
             dt, step = self.world.dt, self.world.max_speed * self.world.dt
             arguments = (position, energy, next_energy, slots[slot], self.geometry)
             _, gain_c, bound_c = sampled_energy_row(*arguments, gain=alpha_c * dt, step=step)
@@ -165,7 +228,7 @@ class SafetyFilter(TensorDictModuleBase):
         if self.safety.split == "joint":
             action, status, residual = self._solve_joint(target, gain_c, bound_c, gain_s, bound_s)
         else:
-            share = 0.5 if self.safety.split == "half" else 1.0
+            share = 1.0 if self.safety.split == "full" else 0.5
             G = torch.cat([gain_c.unsqueeze(-2), _without_self(gain_s)], dim=-2)
             h = torch.cat([bound_c.unsqueeze(-1), share * _without_self(bound_s.unsqueeze(-1)).squeeze(-1)], dim=-1)
             action, status, residual = self._solve_per_robot(target, G, h)
@@ -176,7 +239,7 @@ class SafetyFilter(TensorDictModuleBase):
         """One problem per robot: ``G (*B, N, m, d)``, ``h (*B, N, m)``."""
         radius = self.world.max_speed
         if self.safety.solver == "qpth":
-            faces, offset = _speed_faces(target.shape[-1], radius)
+            faces, offset = speed_faces(target.shape[-1], radius)
             faces = torch.tensor(faces, dtype=target.dtype, device=target.device)
             G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)
             h = torch.cat([h, h.new_full((*h.shape[:-1], len(faces)), offset)], dim=-1)
@@ -218,7 +281,7 @@ class SafetyFilter(TensorDictModuleBase):
         pair_rows[..., pairs, j, :] = gain_s[..., j, i, :]
         eye = torch.eye(n, dtype=gain_c.dtype, device=gain_c.device)
         own_rows = eye.unsqueeze(-1) * gain_c.unsqueeze(-2)
-        faces, offset = _speed_faces(d, self.world.max_speed)
+        faces, offset = speed_faces(d, self.world.max_speed)
         faces = torch.tensor(faces, dtype=gain_c.dtype, device=gain_c.device)
         face_rows = torch.einsum("ij,fd->ifjd", eye, faces).flatten(0, 1).expand(*batch, -1, n, d)
         # a pair's row is asked for if either robot's composite is that pair
@@ -239,8 +302,8 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             ``(*B, N, d)``, m/s.
         """
-        h_c, h_o, h_s = self._barriers(position, energy, slot)
-        alpha_c, alpha_o, alpha_s = self.gains
+        h_c, h_o, h_s = self._barriers(position, energy, slot, self._field(position))
+        alpha_c, alpha_o, alpha_s, _ = self.gains
         current, _ = accepted_current(h_o, alpha_o)
         bound_c = h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
         G, h = self._joint_rows(-h_c.velocity_gain, bound_c, -h_s.velocity_gain, alpha_s * h_s.value)
@@ -248,13 +311,16 @@ class SafetyFilter(TensorDictModuleBase):
         solved = (solution.status == QPStatus.SOLVED).unsqueeze(-1)
         return torch.where(solved, solution.value, 0.0).unflatten(-1, position.shape[-2:])
 
-    def _barriers(self, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
+    def _field(self, position: Tensor) -> Tensor:
+        radii = {"full_radius": self.world.charge_radius_full, "zero_radius": self.world.charge_radius}
+        return charging_field(position, self._layout(position)[0], **radii)
+
+    def _barriers(
+        self, position: Tensor, energy: Tensor, slot: Tensor, field: Tensor
+    ) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
         """Rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
         world = self.world
-        stations, slots = self._layout(position)
-        field = charging_field(
-            position, stations, full_radius=world.charge_radius_full, zero_radius=world.charge_radius
-        )
+        slots = self._layout(position)[1]
         rates = {"charge_rate": world.charge_rate}
         return (
             energy_barrier(position, energy, slots[slot], field, self.literal, **rates),
@@ -262,8 +328,8 @@ class SafetyFilter(TensorDictModuleBase):
             collision_barrier(position, safety_distance=world.safety_distance),
         )
 
-    def _layout(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Stations and slots on the device and in the type of ``like``. Not buffers: the loss must not copy them."""
+    def _layout(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Stations, slots and arena on the device and in the type of ``like``. Not buffers: the loss must not copy them."""
         key = (like.device, like.dtype)
         if key not in self._layouts:
             factory = {"dtype": like.dtype, "device": like.device}
@@ -271,6 +337,7 @@ class SafetyFilter(TensorDictModuleBase):
             self._layouts[key] = (
                 torch.tensor(world.station_positions, **factory),
                 torch.tensor(world.slot_positions, **factory),
+                torch.tensor(world.bounds, **factory),
             )
         return self._layouts[key]
 
@@ -280,23 +347,3 @@ def _without_self(rows: Tensor) -> Tensor:
     n = rows.shape[-2]
     others = other_indices(n, rows.device)
     return rows.gather(-2, others.unsqueeze(-1).expand(*rows.shape[:-3], n, n - 1, rows.shape[-1]))
-
-
-@lru_cache
-def _speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float]:
-    """Face normals and offset of a polytope inscribed in the speed ball."""
-    if dimension == 2:
-        angles = [2 * math.pi * k / POLYGON_FACES for k in range(POLYGON_FACES)]
-        return [[math.cos(a), math.sin(a)] for a in angles], radius * math.cos(math.pi / POLYGON_FACES)
-    normals, probes = _spiral(POLYHEDRON_FACES), _spiral(40_000)
-    # a vertex lies where the nearest normal is farthest; the probes miss it by less than 0.02 rad
-    widest = (probes @ normals.T).amax(dim=-1).clamp(-1, 1).acos().amax().item() + 0.02
-    return normals.tolist(), radius * math.cos(widest)
-
-
-def _spiral(n: int) -> Tensor:
-    """``n`` nearly even directions in 3-D (golden spiral), ``(n, 3)``."""
-    k = torch.arange(n, dtype=torch.float64)
-    z = 1 - (2 * k + 1) / n
-    angle = k * math.pi * (3 - math.sqrt(5))
-    return torch.stack([(1 - z * z).sqrt() * angle.cos(), (1 - z * z).sqrt() * angle.sin(), z], dim=-1)

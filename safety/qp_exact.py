@@ -128,7 +128,7 @@ class Projection(NamedTuple):
     sizes: Tensor
 
 
-def enumerate_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projection:
+def enumerate_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, first: int = 0) -> Projection:
     """Project t on {G u ≤ h} ∩ ball by enumeration of active sets (module docstring).
 
     Args:
@@ -136,13 +136,14 @@ def enumerate_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None) 
         G: (B, m, n) unit rows.
         h: (B, m).
         radius: ball radius or None.
+        first: least size of the active sets; 1 where no target satisfies its rows and all lie in the ball.
     """
     (B, m, n) = G.shape
     inf = t.new_full((B,), torch.inf)
     best = Projection(t.clone(), t.new_zeros(B, m), t.new_ones(B), t.clone(), inf, torch.zeros_like(inf).long())
     score = inf.clone()
     rows, todo = torch.arange(m, device=t.device), torch.arange(B, device=t.device)
-    for k in range(min(n, m) + 1):
+    for k in range(first, min(n, m) + 1):
         sets = torch.combinations(rows, k) if k else rows.new_zeros(1, 0)
         step = max(1, CHUNK_BYTES // (8 * len(sets) * (3 * m + n * (3 * k + 6))))
         for some in todo.split(step):
@@ -162,6 +163,22 @@ def enumerate_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None) 
         if not len(todo):
             break
     return best
+
+
+def _enumerate_reachable(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projection:
+    """:func:`enumerate_projection` without the rows that lie beyond the ball everywhere: they cannot bind."""
+    m = G.shape[1]
+    if radius is None:
+        return enumerate_projection(t, G, h, radius)
+    first = 0 if bool((norm(t) > radius).any()) else 1
+    most = max(1, int((h < radius).sum(-1).max()))
+    if most == m:
+        return enumerate_projection(t, G, h, radius, first)
+    rows = h.topk(most, dim=-1, largest=False).indices
+    found = enumerate_projection(
+        t, G.gather(1, rows[..., None].expand(-1, -1, t.shape[-1])), h.gather(1, rows), radius, first
+    )
+    return found._replace(lam=torch.zeros_like(h).scatter(1, rows, found.lam))
 
 
 def settle(raw: Raw, violation: Tensor, nearest: Tensor, radius: float | None, tol: float) -> Raw:
@@ -194,7 +211,7 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
     index = outside.nonzero()[:, 0]
     if len(index):
         t, (G, h, size, impossible) = t[index], normalise_rows(G[index], h[index])
-        found = enumerate_projection(t, G, h, radius)
+        found = _enumerate_reachable(t, G, h, radius)
         mu = found.c - 1
         residual = kkt_residual(None, -t, G, h, found.u, found.lam, mu, radius)
         residual = torch.where(impossible, torch.inf, residual)

@@ -5,6 +5,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from envs import keys
+from safety.certificate import HOMING
 from safety.qp import QPStatus
 
 
@@ -18,7 +19,17 @@ class FilterStatistics:
     def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
         self.sums = dict.fromkeys(
-            ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside"), 0.0
+            (
+                "robot_steps",
+                "interventions",
+                "correction",
+                "fallbacks",
+                "infeasible",
+                "inaccurate",
+                "outside",
+                "homing",
+            ),
+            0.0,
         )
         self.max_residual = 0.0
 
@@ -31,12 +42,7 @@ class FilterStatistics:
         """
         status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
         correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
-        barriers = [
-            tensordict[key].squeeze(-1)
-            for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)
-        ]
         counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
-        outside = ~torch.stack([h >= 0 for h in barriers]).all(dim=0)
         rows = (
             counts,
             counts & (correction > 1e-6 * self.max_speed),
@@ -44,7 +50,8 @@ class FilterStatistics:
             counts & (level > 0),
             counts & (status == QPStatus.INFEASIBLE),
             counts & (status == QPStatus.INACCURATE),
-            counts & outside,
+            counts & tensordict[keys.OUTSIDE],
+            counts & (level == HOMING),
         )
         totals = torch.stack([row.sum(dtype=torch.float64) for row in rows])
         largest = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max()
@@ -59,6 +66,7 @@ class FilterStatistics:
             "intervention_rate": self.sums["interventions"] / steps,
             "mean_correction": self.sums["correction"] / steps,
             "fallback_rate": self.sums["fallbacks"] / steps,
+            "homing_rate": self.sums["homing"] / steps,
             "infeasible": int(self.sums["infeasible"]),
             "inaccurate": int(self.sums["inaccurate"]),
             "outside": int(self.sums["outside"]),

@@ -130,7 +130,7 @@ def test_accepted_current_is_the_largest_admissible_one():
 
 # ---- the composite h_i = min(h_c, h_o, pairs) -----------------------------------------------------------------------
 def composite(world, position, energy, nominal, **gains):
-    safety = SafetyConfig(composition="min", split="full", sampled_data=False, **gains)
+    safety = SafetyConfig(mode="paper", composition="min", split="full", sampled_data=False, **gains)
     slot = torch.arange(world.n_agents).expand(position.shape[:-1])
     return SafetyFilter(safety, world).filter(nominal, position, energy, slot)
 

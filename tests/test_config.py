@@ -68,7 +68,7 @@ def test_literal_filter_is_one_row_with_full_responsibility():
     safety = to_config(composed("safety=paper")).safety
     assert (safety.composition, safety.split, safety.sampled_data) == ("min", "full", False)
     default = to_config(composed()).safety
-    assert (default.mode, default.composition, default.split) == ("paper", "stacked", "half")
+    assert (default.mode, default.composition, default.split) == ("certified", "stacked", "auto")
 
 
 def test_hash_ignores_what_does_not_change_the_result():

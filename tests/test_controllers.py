@@ -10,6 +10,7 @@ from scipy import sparse
 from torchrl.envs.utils import step_mdp
 
 from agents import make_controller
+from agents.adversaries import ADVERSARIES
 from agents.controllers import CONTROLLERS
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.battery import charging_field
@@ -32,7 +33,7 @@ def drive(controller, env, steps):
     return rows
 
 
-@pytest.mark.parametrize("name", list(CONTROLLERS))
+@pytest.mark.parametrize("name", ["random", *(name for name in CONTROLLERS if name not in ADVERSARIES)])
 @pytest.mark.parametrize("density", DENSITIES)
 @pytest.mark.parametrize("d", [2, 3])
 def test_nominal_action_is_finite_and_within_the_speed_limit(name, density, d):

@@ -15,7 +15,7 @@ from agents.evaluation import evaluate_policy
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.battery import charging_field
 from safety import QPStatus, SafetyConfig, SafetyFilter
-from safety.filter import _speed_faces
+from safety.speed_faces import speed_faces
 
 torch.set_num_threads(1)
 F64 = torch.float64
@@ -64,7 +64,7 @@ def calm_inputs(world, batch=4, *, share=0.5, seed=0):
 
 def run(world, inputs, **safety):
     """Outputs by short name."""
-    f = SafetyFilter(SafetyConfig(**safety), world)
+    f = SafetyFilter(SafetyConfig(**{"mode": "paper", **safety}), world)
     return dict(zip((key[-1] for key in f.out_keys), f.filter(*inputs), strict=True))
 
 
@@ -206,8 +206,8 @@ def test_missing_input_is_named():
     for absent in full:
         td = TensorDict({key: value for key, value in full.items() if key != absent}, [4])
         with pytest.raises(KeyError, match=absent[-1]):
-            SafetyFilter(SafetyConfig(), world)(td)
-    td = SafetyFilter(SafetyConfig(), world)(TensorDict(full, [4]))
+            SafetyFilter(SafetyConfig(mode="paper"), world)(td)
+    td = SafetyFilter(SafetyConfig(mode="paper"), world)(TensorDict(full, [4]))
     assert td[keys.ACTION].shape == (4, 3, 2)
     for key in (
         keys.CHARGE_CURRENT,
@@ -218,6 +218,7 @@ def test_missing_input_is_named():
     ):
         assert td[key].shape == (4, 3, 1)
     assert td[keys.STATUS].shape == td[keys.LEVEL].shape == (4, 3)
+    assert td[keys.OUTSIDE].dtype == torch.bool
     assert td[keys.STATUS].dtype == td[keys.LEVEL].dtype == torch.int64
 
 
@@ -243,7 +244,7 @@ def test_filter_is_a_pure_function(split, d):
     world = make_world(dimension=d)
     inputs = random_inputs(world, 6 if split == "joint" else 30)
     before = [x.clone() for x in inputs]
-    f = SafetyFilter(SafetyConfig(split=split), world)
+    f = SafetyFilter(SafetyConfig(mode="paper", split=split), world)
     first = f.filter(*inputs)
     f.filter(*random_inputs(world, 3, seed=9))
     again = f.filter(*inputs)
@@ -278,7 +279,7 @@ def test_any_batch_shape_and_a_single_robot():
 # ---- solvers and splits agree ----------------------------------------------------------------------------------------
 @DIMENSIONS
 def test_speed_polytope_is_inscribed_and_wide(d):
-    normals, offset = _speed_faces(d, SPEED)
+    normals, offset = speed_faces(d, SPEED)
     normals = torch.tensor(normals, dtype=F64)
     torch.testing.assert_close(normals.norm(dim=-1), torch.ones(len(normals), dtype=F64))
     halfspaces = torch.cat([normals, torch.full((len(normals), 1), -offset, dtype=F64)], 1).numpy()
@@ -295,7 +296,7 @@ def test_qpth_and_exact_agree_inside_the_polytope(d):
     nominal, *rest = crowded_inputs(world, 60 if d == 2 else 24)
     inputs = (0.8 * nominal, *rest)
     exact, qpth = run(world, inputs), run(world, inputs, solver="qpth")
-    inradius = _speed_faces(d, SPEED)[1]
+    inradius = speed_faces(d, SPEED)[1]
     solved = (exact["status"] == 0) & (qpth["status"] == 0)
     inside = solved & (exact["action"].norm(dim=-1) < inradius)
     assert (inside & (exact["correction"].squeeze(-1) > 1e-3)).sum() >= 10
@@ -387,7 +388,7 @@ def test_joint_solution_costs_no_more_than_the_decentralised_one():
 # ---- gradients -------------------------------------------------------------------------------------------------------
 def jacobian(world, inputs, **safety):
     """d action / d nominal of one world, ``(N, d, N, d)``."""
-    f, (nominal, *rest) = SafetyFilter(SafetyConfig(**safety), world), inputs
+    f, (nominal, *rest) = SafetyFilter(SafetyConfig(**{"mode": "paper", **safety}), world), inputs
     return torch.autograd.functional.jacobian(lambda x: f.filter(x, *rest)[0], nominal)
 
 
@@ -423,7 +424,7 @@ def test_gradient_is_finite_everywhere_and_zero_where_held(split):
     nominal, *rest = random_inputs(world, 12 if split == "joint" else 30)
     nominal = nominal.requires_grad_()
     nominal.data[0] = 0
-    f = SafetyFilter(SafetyConfig(split=split), world)
+    f = SafetyFilter(SafetyConfig(mode="paper", split=split), world)
     action, _, correction, status, *_ = f.filter(nominal, *rest)
     (action.sum() + correction.sum()).backward()
     assert nominal.grad.isfinite().all()
@@ -437,7 +438,7 @@ def test_gradient_is_finite_everywhere_and_zero_where_held(split):
 def test_joint_gradient_stays_with_the_own_nominal_and_the_value_is_the_same():
     world = make_world(dtype="float64", stations=[[0.9, 0.0], [-0.5, 0.8], [-0.5, -0.8]])
     inputs = crowded_inputs(world, 6)
-    f = SafetyFilter(SafetyConfig(split="joint"), world)
+    f = SafetyFilter(SafetyConfig(mode="paper", split="joint"), world)
     plain = f.filter(*inputs)
     graphed = f.filter(inputs[0].clone().requires_grad_(), *inputs[1:])
     for a, b in zip(plain, graphed, strict=True):
@@ -454,10 +455,10 @@ def test_joint_gradient_stays_with_the_own_nominal_and_the_value_is_the_same():
 @pytest.mark.parametrize("name", ["alpha_c", "alpha_o", "alpha_s"])
 def test_gain_beyond_one_over_dt_is_refused(name):
     world = make_world(dt=0.2)
-    SafetyFilter(SafetyConfig(**{name: 5.0}), world)
+    SafetyFilter(SafetyConfig(mode="paper", **{name: 5.0}), world)
     for gain in (5.1, 0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match=rf"safety\.{name}={gain}.*\(0, 5\.0\].*alpha dt must not exceed 1"):
-            SafetyFilter(SafetyConfig(**{name: gain}), world)
+            SafetyFilter(SafetyConfig(mode="paper", **{name: gain}), world)
 
 
 @pytest.mark.parametrize(
@@ -465,23 +466,29 @@ def test_gain_beyond_one_over_dt_is_refused(name):
     [
         ({"composition": "min"}, r"safety\.sampled_data=true needs safety\.composition=stacked"),
         ({"split": "joint", "solver": "exact"}, r"safety\.solver='exact'.*safety\.split='joint'"),
-        ({"mode": "certified"}, r"safety\.mode='certified' is not available"),
-        ({"mode": "nothing"}, r"safety\.mode='nothing'.*paper, none"),
-        ({"split": "third"}, r"safety\.split='third'.*half, full, joint"),
+        ({"mode": "nothing"}, r"safety\.mode='nothing'.*certified, paper, none"),
+        ({"split": "third"}, r"safety\.split='third'.*anchor, half, full, joint"),
+        ({"split": "anchor"}, r"safety\.split=anchor does not fit safety\.mode=paper.*half, full, joint"),
+        (
+            {"mode": "certified", "split": "joint"},
+            r"safety\.split=joint does not fit safety\.mode=certified.*anchor, half",
+        ),
+        ({"mode": "certified", "composition": "min"}, r"safety\.mode=certified.*safety\.composition=min"),
+        ({"mode": "certified", "sampled_data": False}, r"safety\.mode=certified.*safety\.sampled_data=False"),
         ({"composition": "max", "sampled_data": False}, r"safety\.composition='max'.*stacked, min"),
         ({"solver": "pdipm"}, r"safety\.solver='pdipm'.*auto, exact, qpth"),
     ],
 )
 def test_configuration_that_cannot_be_is_refused(fields, message):
     with pytest.raises(ValueError, match=message):
-        SafetyConfig(**fields)
+        SafetyConfig(**{"mode": "paper", **fields})
 
 
 def test_default_gains_follow_the_step():
     world = make_world(dt=0.1)
-    assert SafetyConfig().gains(world) == pytest.approx((2, 5, 10))
-    assert SafetyConfig(split="full").gains(world) == pytest.approx((2, 5, 5))
-    assert SafetyConfig(alpha_s=3.0).gains(world) == pytest.approx((2, 5, 3))
+    assert SafetyConfig(mode="paper").gains(world) == pytest.approx((2, 5, 10, 5))
+    assert SafetyConfig(mode="paper", split="full").gains(world) == pytest.approx((2, 5, 5, 5))
+    assert SafetyConfig(mode="paper", alpha_s=3.0).gains(world) == pytest.approx((2, 5, 3, 5))
 
 
 # ---- in the world ----------------------------------------------------------------------------------------------------
@@ -492,7 +499,7 @@ def docked_energy(*, filtered, steps=160, **fields):
     slots = env.slots[: world.n_agents].expand(8, -1, -1)
     energy = 0.5 + 0.4 * uniform(8, world.n_agents, 1, seed=0)
     td = env.set_state(slots, energy, torch.arange(world.n_agents).view(1, -1, 1))
-    f, rows = SafetyFilter(SafetyConfig(), world), []
+    f, rows = SafetyFilter(SafetyConfig(mode="paper"), world), []
     for _ in range(steps):
         td[keys.NOMINAL_ACTION] = torch.zeros_like(td[keys.POSITION])
         td = f(td) if filtered else td.set(keys.ACTION, td[keys.NOMINAL_ACTION])
@@ -520,7 +527,7 @@ def measure(controller, *, n_agents=3, worlds=32, steps=200, **safety):
     """Counted violations of a controller behind a filter, and all metrics."""
     world = SurveillanceConfig(n_agents=n_agents, on_violation="continue")
     policy = TensorDictSequential(
-        make_controller(controller, world, seed=2), SafetyFilter(SafetyConfig(**safety), world)
+        make_controller(controller, world, seed=2), SafetyFilter(SafetyConfig(**{"mode": "paper", **safety}), world)
     )
     metrics, statistics, _ = evaluate_policy(SurveillanceEnv(world, worlds, seed=1), policy, steps)
     return metrics["violations"], metrics, statistics

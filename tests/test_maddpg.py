@@ -344,7 +344,7 @@ def test_gradient_in_the_loss_matches_finite_differences():
 
 
 def test_joint_filter_in_the_loss_keeps_neighbours_detached():
-    s = fast(in_loss=True, split="joint")
+    s = fast(in_loss=True, mode="paper", split="joint")
     s.batch = s.batch[::8]
     loss = s.loss(s.batch)["loss_actor"]
     assert loss.isfinite().all()

@@ -38,10 +38,7 @@ def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
             **{("next", *keys.VIOLATION, kind): flag for kind, flag in flags.items()},
             **{key: zeros.long() for key in (keys.STATUS, keys.LEVEL)},
             **{key: zeros.unsqueeze(-1) for key in (keys.CORRECTION, keys.RESIDUAL)},
-            **{
-                key: zeros.unsqueeze(-1) + 1
-                for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)
-            },
+            keys.OUTSIDE: zeros.bool(),
         },
         (1, 2),
     )

@@ -1,7 +1,5 @@
 """Filter statistics against a loop over robot-steps."""
 
-import math
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -15,6 +13,7 @@ ZERO = {
     "intervention_rate": 0.0,
     "mean_correction": 0.0,
     "fallback_rate": 0.0,
+    "homing_rate": 0.0,
     "infeasible": 0,
     "inaccurate": 0,
     "outside": 0,
@@ -35,9 +34,7 @@ def diagnostics(seed, *batch):
             keys.STATUS: torch.randint(0, 3, (*batch, 3), generator=gen),
             keys.LEVEL: torch.randint(0, 3, (*batch, 3), generator=gen),
             keys.RESIDUAL: real(0, 1e-6),
-            keys.BARRIER_ENERGY: real(-0.1, 0.5),
-            keys.BARRIER_OVERCHARGE: real(-0.1, 0.5),
-            keys.BARRIER_COLLISION: torch.where(touched, real(-0.1, 0.5), torch.inf),
+            keys.OUTSIDE: torch.rand(*batch, 3, generator=gen) < 0.4,
         },
         batch,
     )
@@ -45,7 +42,7 @@ def diagnostics(seed, *batch):
 
 def by_hand(parts):
     """Loop over (diagnostics, alive) pairs with batch (B,)."""
-    steps = moved = fallen = infeasible = inaccurate = outside = 0
+    steps = moved = fallen = infeasible = inaccurate = outside = homing = 0
     correction, residual = 0.0, 0.0
     for td, alive in parts:
         for b in range(td.shape[0]):
@@ -55,19 +52,20 @@ def by_hand(parts):
                 steps += 1
                 amount = td[keys.CORRECTION][b, i, 0].item()
                 status = td[keys.STATUS][b, i].item()
-                barriers = (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION)
                 moved += amount > 1e-6 * SPEED
                 correction += amount
                 fallen += td[keys.LEVEL][b, i].item() > 0
                 infeasible += status == 2
                 inaccurate += status == 1
-                outside += any(td[key][b, i, 0].item() < 0 for key in barriers)
+                outside += td[keys.OUTSIDE][b, i].item()
+                homing += td[keys.LEVEL][b, i].item() == 2
                 if status == 0:
                     residual = max(residual, td[keys.RESIDUAL][b, i, 0].item())
     return {
         "intervention_rate": moved / steps,
         "mean_correction": correction / steps,
         "fallback_rate": fallen / steps,
+        "homing_rate": homing / steps,
         "infeasible": infeasible,
         "inaccurate": inaccurate,
         "outside": outside,
@@ -106,16 +104,6 @@ def test_batches_of_any_shape_are_the_same():
     for k in range(5):
         parts.update(td[:, k])
     assert whole.summary() == pytest.approx(parts.summary())
-
-
-def test_nan_barrier_counts_as_outside():
-    td = diagnostics(0, 1)
-    for key in (keys.BARRIER_ENERGY, keys.BARRIER_OVERCHARGE, keys.BARRIER_COLLISION):
-        td[key] = torch.ones(1, 3, 1)
-    td[keys.BARRIER_ENERGY][0, 1] = math.nan
-    statistics = FilterStatistics(SPEED)
-    statistics.update(td)
-    assert statistics.summary()["outside"] == 1
 
 
 def test_nothing_counted_is_zero():

@@ -17,10 +17,11 @@ TINY = (
 VARIANTS = {
     **{experiment: (f"experiment={experiment}",) for experiment in ("default", "smoke", "paper", "paper_literal")},
     "literal filter": ("safety=paper",),
+    "stacked filter": ("safety=stacked",),
     "unfiltered": ("safety=none",),
-    "joint filter": ("safety.split=joint",),
+    "joint filter": ("safety=joint",),
     "filter in the loss": ("safety.in_loss=true", "agent.correction_penalty=0.1"),
-    "joint filter in the loss": ("safety.split=joint", "safety.in_loss=true"),
+    "joint filter in the loss": ("safety=joint", "safety.in_loss=true"),
     "qpth per robot": ("safety.solver=qpth",),
     "independent learners": ("agent=ddpg",),
     "shared gradient": ("agent.gradient=shared", "agent.share_params=true"),
@@ -139,7 +140,7 @@ def test_same_seed_same_result(program, tmp_path):
 def test_controller_evaluation_writes_its_own_folder(program, tmp_path):
     code, output = program(evaluate.main, "controller=lloyd", "steps=10", "num_envs=2", "pictures=false")
     assert code == 0, output
-    (result,) = tmp_path.glob("runs/controllers/lloyd_stacked_default_10_0_*/eval.json")
+    (result,) = tmp_path.glob("runs/controllers/lloyd_certified_default_10_0_*/eval.json")
     assert json.loads(result.read_text())["robot_steps"] == 60
 
 

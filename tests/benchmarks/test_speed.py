@@ -35,7 +35,7 @@ def test_step(n_agents, num_envs):
     env = SurveillanceEnv(world, num_envs)
     filters = {
         "none": SafetyConfig(mode="none"),
-        "paper": SafetyConfig(composition="min", split="full", sampled_data=False),
+        "paper": SafetyConfig(mode="paper", composition="min", split="full", sampled_data=False),
         "stacked": SafetyConfig(),
     }
     td = SafetyFilter(filters["none"], world)(make_controller("random", world)(env.reset()))
