@@ -5,8 +5,10 @@ controller=<name> env=… safety=…`` writes a folder under ``runs/controllers/
 paper's Figs 5-7, a GIF and the battery plot of the first world.
 """
 
+import functools
 import json
 import logging
+import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -20,12 +22,14 @@ from tqdm import tqdm
 from agents import make_controller
 from agents.checkpoint import find_checkpoint, load_checkpoint
 from agents.evaluation import evaluate_policy
+from agents.incident import check_violations
 from agents.networks import make_actor
 from agents.pipeline import pick_device
 from conf.callbacks import one_clear_error
 from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
+from envs.inequalities import derived_quantities
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
 from safety import SafetyConfig, SafetyFilter
 
@@ -40,6 +44,9 @@ def main(cfg: DictConfig) -> None:
     config: EvaluateConfig = to_config(cfg)
     device = pick_device(config.device)
     folder = Path(HydraConfig.get().runtime.output_dir)
+    if config.resume == "auto" and (folder / "eval.json").is_file():  # a job of a multirun
+        tqdm.write(f"{folder}/eval.json exists: nothing to do. resume=never evaluates anew.")
+        return
     env_seed, controller_seed = np.random.SeedSequence(config.seed).generate_state(2).tolist()
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
@@ -52,17 +59,25 @@ def main(cfg: DictConfig) -> None:
         name = str(checkpoint)
     else:
         name = config.controller or ""
-        nominal = make_controller(name, world, seed=controller_seed)
+        nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
     policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
     steps = config.steps or rollout_steps(world.horizon)
-    metrics, statistics, trajectory = evaluate_policy(env, policy, steps, record=config.pictures)
+    check = functools.partial(check_violations, world=world, safety=safety, folder=folder)
+    start = time.perf_counter()
+    metrics, statistics, trajectory = evaluate_policy(
+        env, policy, steps, record=config.pictures, restart=config.restart, check=check
+    )
     content = {
         **metrics,
         "filter": statistics,
+        "task": {} if isinstance(source, Config) else nominal.metrics(),
+        "wall_time_s": time.perf_counter() - start,
+        "certificate": derived_quantities(world),
         "steps": steps,
         "num_envs": config.num_envs,
         "seed": config.seed,
         "policy": name,
+        "adversary": config.adversary,
         "git_hash": git_hash(),
         "env": asdict(world),
         "safety": asdict(safety),

@@ -3,6 +3,7 @@
 ``python train.py --help`` explains the command line; README.md the run folder and the TensorBoard tags.
 """
 
+import functools
 import json
 import logging
 import sys
@@ -17,16 +18,18 @@ from omegaconf import DictConfig
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents.checkpoint import keep_newest, save_checkpoint, set_aside
+from agents.checkpoint import keep_newest, save_checkpoint, set_aside, world_sizes
 from agents.evaluation import evaluate_policy, evaluation_scalars
+from agents.incident import check_violations
 from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
-from conf.schema import Config, config_hash, finished_run, register, rollout_steps, to_config, world_sizes, write_json
+from conf.schema import Config, config_hash, finished_run, register, rollout_steps, to_config, write_json
 from conf.versions import git_hash, package_versions
-from envs import SurveillanceEnv
+from envs import SurveillanceEnv, keys
+from envs.inequalities import derived_quantities
 from envs.rendering import save_training_curve
 
 register()
@@ -60,6 +63,11 @@ def main(cfg: DictConfig) -> None:
     collector = make_collector(env, explore_policy, config.collector.frames_per_batch, config.collector.total_frames)
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
     writer = SummaryWriter(str(folder))
+    adversary = config.adversary_reward()
+    check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
+    certificate = derived_quantities(config.env)
+    write_json(folder / "certificate.json", certificate)
+    tqdm.write("certificate: " + ", ".join(f"{name} {value:.4g}" for name, value in certificate.items()))
 
     def log(scalars: dict[str, float]) -> None:
         for tag, value in scalars.items():
@@ -67,7 +75,8 @@ def main(cfg: DictConfig) -> None:
 
     def evaluate() -> dict:
         eval_env.set_seed(eval_seed)  # the same start states every time
-        metrics, _, _ = evaluate_policy(eval_env, policy, config.eval.steps or rollout_steps(config.env.horizon))
+        steps = config.eval.steps or rollout_steps(config.env.horizon)
+        metrics, _, _ = evaluate_policy(eval_env, policy, steps, check=check)
         log(evaluation_scalars(metrics))
         return metrics
 
@@ -97,7 +106,9 @@ def main(cfg: DictConfig) -> None:
     mark = time.perf_counter()
     for batch in collector:
         recorder.update(batch)
-        buffer.extend(to_transitions(batch, config.train.violation_penalty))
+        check(batch)
+        transitions = to_transitions(batch, config.train.violation_penalty, adversary)
+        buffer.extend(transitions)
         collected = time.perf_counter()
         if recorder.frames >= config.train.warmup_frames:
             for _ in range(config.train.n_updates):
@@ -105,6 +116,7 @@ def main(cfg: DictConfig) -> None:
         updated = time.perf_counter()
         if log_due(recorder.frames):
             scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
+            scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # as stored: the objective's
             numbers = {name: float(value) for name, value in losses.items()}
             check_finite(numbers, recorder.frames)
             log(scalars | {f"loss/{name}": value for name, value in numbers.items()})

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import torch
 
+from envs import SurveillanceEnv
+
 FORMAT = 1
+WORLD_REMEDY = "Use the world that the run was trained in (leave env out), or train in this one."
 
 
 class CheckpointError(ValueError):
@@ -41,7 +44,15 @@ def set_aside(folder: Path) -> Path | None:
     Returns:
         The folder moved to; None if there was nothing.
     """
-    patterns = ("checkpoints", "figures", "eval", "summary.json", "events.out.tfevents.*")
+    patterns = (
+        "checkpoints",
+        "figures",
+        "eval",
+        "summary.json",
+        "certificate.json",
+        "violation.json",
+        "events.out.tfevents.*",
+    )
     found = [path for pattern in patterns for path in folder.glob(pattern)]
     if not found:
         return None
@@ -99,13 +110,19 @@ def find_checkpoint(run: Path, name: str | None) -> Path:
     return latest_checkpoint(run) if name is None else run / "checkpoints" / name
 
 
-def check_world(path: Path, found: dict, needed: dict) -> None:
+def world_sizes(env: SurveillanceEnv) -> dict[str, int]:
+    """The sizes that networks are made for."""
+    return {"n_agents": env.config.n_agents, "dimension": env.config.dimension, "n_observation": env.n_observation}
+
+
+def check_world(path: Path, found: dict, needed: dict, remedy: str = WORLD_REMEDY) -> None:
     """Compare the sizes that a checkpoint's networks were made for with the world they are to be used in.
 
     Args:
         path: for the message.
         found: sizes stored in the checkpoint.
         needed: sizes of the present world.
+        remedy: what the message advises.
 
     Raises:
         CheckpointError: naming each size that differs.
@@ -114,7 +131,4 @@ def check_world(path: Path, found: dict, needed: dict) -> None:
         f"{name} is {found.get(name)} there, {value} here" for name, value in needed.items() if found.get(name) != value
     ]
     if different:
-        raise CheckpointError(
-            f"checkpoint {path} is of another world: {'; '.join(different)}. Use the world that the run was trained in "
-            "(leave env out), or train in this one."
-        )
+        raise CheckpointError(f"checkpoint {path} is of another world: {'; '.join(different)}. {remedy}")

@@ -1,4 +1,6 @@
-"""Controllers that are not learned: nominal policies to compare with. Each writes ("agents", "nominal_action")."""
+"""Nominal policies to compare with, by name. Each writes ("agents", "nominal_action")."""
+
+from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -6,6 +8,7 @@ from torch import Tensor
 
 from agents.adversaries import ADVERSARIES, Random
 from agents.base import Controller
+from agents.learned import Learned
 from agents.patrol import Patrol
 from envs import SurveillanceConfig, keys
 from envs.coverage import coverage_cost, coverage_gradient, voronoi_moments
@@ -103,23 +106,31 @@ CONTROLLERS: dict[str, type[Controller]] = {
     "coverage_cbf_literal": CoverageCBFLiteral,
     "patrol": Patrol,
     **ADVERSARIES,
+    "learned": Learned,
 }
 
 
-def make_controller(name: str, config: SurveillanceConfig, seed: int = 0) -> Controller:
+def make_controller(
+    name: str, config: SurveillanceConfig, seed: int = 0, adversary: str | Path | None = None
+) -> Controller:
     """Controller by name.
 
     Args:
         name: one of :data:`CONTROLLERS`.
         config: the world.
         seed: seed of the controller's own generator.
+        adversary: for ``learned`` only: folder of the run that trained it; None = the one that the package ships.
 
     Returns:
         A TensorDictModule that writes ("agents", "nominal_action").
 
     Raises:
-        ValueError: if the name is unknown.
+        ValueError: if the name is unknown, or if the learned adversary does not fit the world.
     """
     if name not in CONTROLLERS:
         raise ValueError(f"controller={name!r} is unknown: choose one of {', '.join(CONTROLLERS)}.")
+    if name == "learned":
+        return Learned(config, seed, adversary)
+    if adversary is not None:
+        raise ValueError(f"adversary={adversary} belongs to controller=learned, not to controller={name}.")
     return CONTROLLERS[name](config, seed)

@@ -1,10 +1,13 @@
 """Deterministic rollouts of a policy in many worlds, measured as they run (nothing is stored but one world's history)."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from envs import SurveillanceEnv, keys
@@ -17,7 +20,13 @@ RECORD_LIMIT = 2000  # samples of the recorded world; longer rollouts keep every
 
 @torch.no_grad()
 def evaluate_policy(
-    env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, *, record: bool = False
+    env: SurveillanceEnv,
+    policy: TensorDictModuleBase,
+    steps: int,
+    *,
+    record: bool = False,
+    restart: bool = False,
+    check: Callable[[TensorDictBase, Tensor], None] | None = None,
 ) -> tuple[dict, dict, Trajectory | None]:
     """Roll a filtered policy out from fresh start states; a world counts until it terminates (a time limit does not end it).
 
@@ -26,6 +35,9 @@ def evaluate_policy(
         policy: writes ("agents", "action") and the filter's diagnostics.
         steps: length of the rollout.
         record: keep the history of the first world.
+        restart: draw a terminated world anew and go on counting in it.
+        check: called with every transition and the worlds that count, ``(*B, 1)`` bool, such as
+            :func:`agents.incident.check_violations`.
 
     Returns:
         Metrics (the block ``eval`` of summary.json), the filter's statistics and the history, if recorded.
@@ -38,6 +50,7 @@ def evaluate_policy(
     energy_margin = distance_margin = torch.full((), math.inf, dtype=config.torch_dtype, device=env.device)
     charges = ChargeCounter(td[keys.ENERGY].squeeze(-1), config)
     statistics = FilterStatistics(config.max_speed)
+    restarts = torch.zeros((), dtype=torch.int64, device=env.device)
     history = _History(env, every=math.ceil(steps / RECORD_LIMIT)) if record else None
     for k in range(steps):
         td = env.step(policy(td))
@@ -56,8 +69,16 @@ def evaluate_policy(
         statistics.update(td, alive)
         if history is not None and alive[0]:
             history.add(k, td)
-        alive = alive & ~following["terminated"]
-        td = step_mdp(td)
+        if check is not None:
+            check(td, alive)
+        ended, td = following["terminated"], step_mdp(td)
+        if restart:
+            restarts += (ended & alive).sum()
+            if ended.any():
+                td = env.reset(td.set("_reset", ended))
+                charges.restart(td[keys.ENERGY].squeeze(-1), ended)
+        else:
+            alive = alive & ~ended
     metrics = {
         "coverage_cost": float(total["cost"] / total["worlds"].clamp_min(1)),
         "episode_reward": float(total["reward"] / env.batch_size.numel()),
@@ -66,7 +87,7 @@ def evaluate_policy(
         "min_energy_margin": _finite(energy_margin),
         "min_distance_margin": _finite(distance_margin),
         "robot_steps": int(total["worlds"]) * config.n_agents,
-        "terminated_worlds": int((~alive).sum()),
+        "terminated_worlds": int(restarts) if restart else int((~alive).sum()),
     }
     return metrics, statistics.summary(), None if history is None else history.trajectory()
 
@@ -79,7 +100,7 @@ def evaluation_scalars(metrics: dict) -> dict[str, float]:
     return scalars | {f"eval/violations_{kind}": count for kind, count in metrics["violations"].items()}
 
 
-def _finite(value: torch.Tensor) -> float | None:
+def _finite(value: Tensor) -> float | None:
     """None (JSON null) where there is nothing to measure, such as the distance of a single robot."""
     return float(value) if math.isfinite(value) else None
 

@@ -6,6 +6,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from agents.adversary_reward import AdversaryReward
 from envs import SurveillanceEnv, keys
 
 STORED = (
@@ -51,17 +52,22 @@ def make_buffer(capacity: int, batch_size: int, device: torch.device, seed: int)
     )
 
 
-def to_transitions(batch: TensorDictBase, violation_penalty: float = 0.0) -> TensorDictBase:
+def to_transitions(
+    batch: TensorDictBase, violation_penalty: float = 0.0, adversary: AdversaryReward | None = None
+) -> TensorDictBase:
     """Flatten a collected batch to the transitions that are stored.
 
     Args:
         batch: ``(num_envs, T)``.
         violation_penalty: subtracted from a robot's reward per violation of its own (a baseline; 0 = off).
+        adversary: takes the place of the environment's reward.
 
     Returns:
         ``(num_envs * T,)``.
     """
     transitions = batch.select(*STORED).reshape(-1)
+    if adversary is not None:
+        transitions["next"][keys.REWARD] = adversary(transitions["next"])
     if violation_penalty:
         count = sum(batch["next"][(*keys.VIOLATION, kind)].float() for kind in keys.VIOLATION_KINDS).flatten(0, 1)
         transitions["next"][keys.REWARD] = transitions["next"][keys.REWARD] - violation_penalty * count

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from agents.checkpoint import CheckpointError
+from agents.incident import ViolationError
 from agents.maddpg import DivergedError
 from conf.schema import check_evaluation, finished_run, to_config
 
@@ -23,6 +24,7 @@ EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration t
 EXPECTED_IN_RUN = (
     CheckpointError,
     DivergedError,
+    ViolationError,
     OSError,
     OmegaConfBaseException,
 )  # anything else is a programming error

@@ -9,8 +9,9 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from agents import AgentConfig
-from agents.checkpoint import check_world, find_checkpoint, load_checkpoint
+from agents import AgentConfig, make_controller
+from agents.adversary_reward import BARRIERS, AdversaryReward
+from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
 from agents.controllers import CONTROLLERS
 from agents.maddpg import check_penalty
 from agents.pipeline import pick_device
@@ -77,12 +78,25 @@ class TrainConfig:
     """World-steps collected (noisy filtered policy) before the first update, >= 0."""
     violation_penalty: float = 0.0
     """Baseline only: subtracted from a robot's reward for each violation of its own, >= 0."""
+    objective: str = "coverage"
+    """coverage: the environment's reward. adversary: each robot is paid for small barriers (agents/adversary_reward.py)."""
+    attack: list[str] = field(default_factory=lambda: ["survivability", "collision", "certificate"])
+    """adversary: the barriers that count, of survivability, overcharge, collision, certificate (the last two for several
+    robots, certificate behind the certified filter only)."""
 
     def __post_init__(self) -> None:
         """Check every field."""
         check_range("train.n_updates", self.n_updates, 0, 10**6)
         check_range("train.warmup_frames", self.warmup_frames, 0, 10**12)
         check_range("train.violation_penalty", self.violation_penalty, 0, 1e9)
+        check_choice("train.objective", self.objective, ("coverage", "adversary"))
+        for name in self.attack:
+            check_choice("train.attack", name, BARRIERS)
+        if self.objective == "adversary" and self.violation_penalty:
+            raise ValueError(
+                f"train.violation_penalty={self.violation_penalty} punishes what train.objective=adversary is after: set one of "
+                "them back (0, coverage)."
+            )
 
 
 @dataclass
@@ -153,6 +167,13 @@ class Config:
             raise ValueError("compile=true is not available yet: use compile=false.")
         self.safety.gains(self.env)
         check_penalty(self.agent, self.safety)
+        self.adversary_reward()
+
+    def adversary_reward(self) -> AdversaryReward | None:
+        """What the objective puts in the place of the environment's reward; None for coverage."""
+        if self.train.objective == "coverage":
+            return None
+        return AdversaryReward(self.env, self.safety, self.train.attack)
 
 
 @dataclass
@@ -162,7 +183,9 @@ class EvaluateConfig:
     run: str | None = None
     """Folder of a training run (its world and filter are used, with env.* and safety.* overrides applied to them)."""
     controller: str | None = None
-    """Name of a controller that is not learned."""
+    """Name of a controller."""
+    adversary: str | None = None
+    """controller=learned: folder of the run that trained it (newest checkpoint); null = the one shipped, for the default world."""
     checkpoint: str | None = None
     """File in the run's checkpoints folder, such as frames_000000100000.pt; null = the newest."""
     steps: int = 0
@@ -175,6 +198,10 @@ class EvaluateConfig:
     """auto | cpu | cuda."""
     pictures: bool = True
     """Write pictures and the GIF of the first world, not only eval.json."""
+    restart: bool = False
+    """Draw a world anew after a violation and go on counting in it; otherwise it counts until its first one."""
+    resume: str = "never"
+    """auto: an evaluation that has its eval.json is left alone, so that a killed sweep goes on. never: evaluate anew."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
@@ -185,16 +212,21 @@ class EvaluateConfig:
         _check_common(self)
         check_range("steps", self.steps, 0, 10**9)
         check_range("num_envs", self.num_envs, 1, 10**6)
+        check_choice("resume", self.resume, ("auto", "never"))
         if (self.run is None) == (self.controller is None):
             raise ValueError(
                 f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>."
             )
         if self.controller is not None:
             check_choice("controller", self.controller, tuple(CONTROLLERS))
-        if self.run is not None and not (Path(self.run) / ".hydra" / "config.yaml").is_file():
-            raise ValueError(
-                f"run={self.run} is not the folder of a run: {self.run}/.hydra/config.yaml does not exist."
-            )
+        if self.adversary is not None and self.controller != "learned":
+            raise ValueError(f"adversary={self.adversary} goes with controller=learned, not with {self.controller}.")
+        for name in ("run", "adversary"):
+            folder = getattr(self, name)
+            if folder is not None and not (Path(folder) / ".hydra" / "config.yaml").is_file():
+                raise ValueError(
+                    f"{name}={folder} is not the folder of a run: {folder}/.hydra/config.yaml does not exist."
+                )
         self.safety.gains(self.env)
 
 
@@ -236,14 +268,19 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
     return to_config(given)
 
 
-def world_sizes(env: SurveillanceEnv) -> dict[str, int]:
-    """The sizes that networks are made for."""
-    return {"n_agents": env.config.n_agents, "dimension": env.config.dimension, "n_observation": env.n_observation}
-
-
 def check_evaluation(cfg: DictConfig) -> None:
     """Raise what is wrong with an evaluation before anything is written: values, run folder, checkpoint, its world."""
     config = to_config(cfg)
+    if config.adversary is not None:
+        trained = OmegaConf.load(Path(config.adversary) / ".hydra" / "config.yaml")
+        objective = OmegaConf.select(trained, "train.objective")
+        if objective != "adversary":
+            raise ValueError(
+                f"adversary={config.adversary} is a run with train.objective={objective or 'coverage'}, not an adversary's: "
+                "evaluate it with run=<folder>, or train one with python train.py experiment=adversary."
+            )
+    if config.controller == "learned":
+        make_controller("learned", config.env, adversary=config.adversary)  # its checkpoint and the world's sizes
     if config.run is not None:
         world = run_config(cfg, list(cfg.hydra.overrides.task)).env
         path = find_checkpoint(Path(config.run), config.checkpoint)

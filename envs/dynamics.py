@@ -43,3 +43,12 @@ def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Ten
     """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar products over a short last dimension, whose reduction is slow otherwise: ``(*B, d), (*B, d) -> (*B)``."""
+    products = (a * b).unbind(-1)
+    total = products[0]
+    for product in products[1:]:
+        total = total + product
+    return total

@@ -18,9 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import pair_indices
+from envs.dynamics import dot, pair_indices
 
 TINY = 1e-30  # below it a length is 0
+EXCHANGES = 8  # exchanges of slots whose certificate is tried in a step; an exchange of two robots comes twice
 
 
 @dataclass(frozen=True)
@@ -95,17 +96,17 @@ def homing_velocity(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     return offset * torch.clamp(geometry.speed / distance.clamp_min(TINY), max=1 / geometry.dt)
 
 
-class ClosestMoment(NamedTuple):
-    """Where two homing robots come closest: what the gradient of the closest approach needs."""
+class ClosestMoments(NamedTuple):
+    """Where two homing robots come closest on each of the S straight pieces of their relative path."""
 
     distance: Tensor
-    """``G_ij (*B, P)``, m."""
+    """Distance then, ``(S, *B, P)``, m; its least is ``G``."""
     relative: Tensor
-    """Relative position ``xi_i - xi_j`` at that moment, ``(*B, P, d)``, m."""
+    """Relative position ``xi_i - xi_j`` then, ``(S, d, *B, P)``, m."""
     share: Tensor
-    """``l / D``: share of the way home still to go for i and j, ``(2, *B, P)``."""
+    """``l / D``: share of the way home still to go for i and j, ``(S, 2, *B, P)``."""
     slope: Tensor
-    """``dl / dD``: by how much the way to go grows with the distance at the start, for i and j, ``(2, *B, P)``."""
+    """``dl / dD``: by how much the way to go grows with the distance at the start, for i and j, ``(S, 2, *B, P)``."""
 
 
 def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> Tensor:
@@ -131,29 +132,23 @@ def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGe
     return squared.amin(dim=0).sqrt()
 
 
-def closest_moment(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestMoment:
-    """The closest approach of every pair together with its moment; arguments as :func:`closest_approach`."""
+def closest_moments(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestMoments:
+    """The moments of closest approach on each straight piece; arguments as :func:`closest_approach`."""
     if geometry.family == "logarithmic":
-        start, end = _relative_ends(position, slot_position)
-        along = end - start
-        t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(TINY)).clamp(0, 1)
-        relative = start + t.unsqueeze(-1) * along
-        share = (1 - t).expand(2, *t.shape)
-        return ClosestMoment(relative.norm(dim=-1), relative, share, share)
-    distance, whole, times, relative = _relative_path(position, slot_position, geometry)
-    t, squared = _nearest_on_segments(relative)
-    least, index = squared.min(dim=0, keepdim=True)
-    t = t.gather(0, index)
-    before, after = times.gather(0, index), times.gather(0, index + 1)
-    time = before + t * (after - before)
-    wide = index.unsqueeze(1).expand(-1, *relative.shape[1:])
-    start, end = relative.gather(0, wide).squeeze(0), relative.gather(0, wide + 1).squeeze(0)
+        corners = torch.stack(_relative_ends(position, slot_position)).movedim(-1, 1)
+        t, squared = _nearest_on_segments(corners)
+        relative = corners[:1] + t.unsqueeze(1) * (corners[1:] - corners[:1])
+        share = (1 - t).unsqueeze(1).expand(-1, 2, *t.shape[1:])
+        return ClosestMoments(squared.sqrt(), relative, share, share)
+    distance, whole, times, corners = _relative_path(position, slot_position, geometry)
+    t, squared = _nearest_on_segments(corners)
+    time = (times[:-1] + t * (times[1:] - times[:-1])).unsqueeze(1)
     to_go = _to_go(distance, whole, time, geometry)
     slope = torch.where(time <= whole, 1.0, (whole + 1 - time).clamp_min(0))
-    share = torch.where(
-        distance > 0, to_go / distance.clamp_min(TINY), slope
-    )  # in the slot the last step's ratio stands
-    return ClosestMoment(least.squeeze(0).sqrt(), (start + t * (end - start)).movedim(0, -1), share, slope)
+    # in the slot the last step's ratio stands
+    share = torch.where(distance > 0, to_go / distance.clamp_min(TINY), slope)
+    relative = corners[:-1] + t.unsqueeze(1) * (corners[1:] - corners[:-1])
+    return ClosestMoments(squared.sqrt(), relative, share, slope)
 
 
 def _relative_ends(position: Tensor, slot_position: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,7 +221,8 @@ def certified_robots(
     Returns:
         ``(*B, N)`` bool; NaN fails.
     """
-    distance = (position - slot_position).square().sum(-1).sqrt()
+    offset = position - slot_position
+    distance = dot(offset, offset).sqrt()
     spare = energy - geometry.energy_min - margins * geometry.eps_energy - reserve(distance, geometry)
     wall = (3 - margins) / 2 * geometry.eps_distance  # a robot at the wall must not leave the set by one rounding
     inside = ((position >= bounds[:, 0] - wall) & (position <= bounds[:, 1] + wall)).all(dim=-1)
@@ -275,7 +271,14 @@ def is_certified(
 
 
 def exchange_slots(position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor, geometry: HomingGeometry) -> Tensor:
-    """The one exchange (or move to a free slot) that shortens the squared way home most; no change where none does.
+    """The first of :func:`best_exchanges`, ``(*B, N)`` int64."""
+    return best_exchanges(position, energy, slot, slots, geometry, 1).squeeze(-2)
+
+
+def best_exchanges(
+    position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor, geometry: HomingGeometry, count: int
+) -> Tensor:
+    """The exchanges (or moves to a free slot) that shorten the squared way home most; no change where none does.
 
     Robot i takes slot s; the robot that owned s, if any, takes i's. Both must keep their energy reserve.
 
@@ -285,9 +288,10 @@ def exchange_slots(position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor
         slot: ``(*B, N)`` int64, a one-to-one assignment.
         slots: ``(S, d)``, m.
         geometry: constants of the backup motion.
+        count: number of exchanges asked for, at most N S.
 
     Returns:
-        ``(*B, N)`` int64, one-to-one.
+        ``(*B, count, N)`` int64, each one-to-one, the best one first.
     """
     n_slots = slots.shape[0]
     way = (position.unsqueeze(-2) - slots).norm(dim=-1)  # robot i to slot s: (*B, N, S)
@@ -303,29 +307,34 @@ def exchange_slots(position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor
     owner_way = own_way.squeeze(-1).gather(-1, owner_of).unsqueeze(-2)
     zero = torch.zeros((), dtype=way.dtype, device=way.device)
     gain = own_way - cost + torch.where(taken, owner_way - cross, zero)
-    best, index = gain.nan_to_num(nan=-torch.inf).flatten(-2).max(dim=-1)
-    robot, target = index // n_slots, index % n_slots
+    best, index = gain.nan_to_num(nan=-torch.inf).flatten(-2).topk(count, dim=-1)
+    robot, target = index // n_slots, (index % n_slots).unsqueeze(-1)
     robots = torch.arange(slot.shape[-1], device=slot.device)
-    old = slot.gather(-1, robot.unsqueeze(-1))
-    swapped = torch.where(slot == target.unsqueeze(-1), old, slot)
-    swapped = torch.where(robots == robot.unsqueeze(-1), target.unsqueeze(-1), swapped)
+    old = slot.gather(-1, robot).unsqueeze(-1)
+    swapped = torch.where(slot.unsqueeze(-2) == target, old, slot.unsqueeze(-2))
+    swapped = torch.where(robots == robot.unsqueeze(-1), target, swapped)
     # a relative threshold: rounding must not make two robots trade slots for ever
     worth = best > 1e-5 * geometry.charge_radius**2
-    return torch.where(worth.unsqueeze(-1), swapped, slot)
+    return torch.where(worth.unsqueeze(-1), swapped, slot.unsqueeze(-2))
 
 
 def reassign_slots(
     position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor, geometry: HomingGeometry, bounds: Tensor
 ) -> Tensor:
-    """Adopt the best exchange of slots exactly where the state is certified under it (SAFETY section 4.4).
+    """Adopt the best of a few exchanges under which the state is certified, none where there is no such (docs/safety.md, 9).
 
-    Args and shapes as :func:`exchange_slots`; ``bounds`` ``(d, 2)`` is the arena.
+    Args and shapes as :func:`best_exchanges`; ``bounds`` ``(d, 2)`` is the arena.
 
     Returns:
         ``(*B, N)`` int64, one-to-one.
     """
-    candidate = exchange_slots(position, energy, slot, slots, geometry)
-    changed = (candidate != slot).any(dim=-1)
-    some = changed.nonzero(as_tuple=True)  # few worlds exchange in a step: the certificate of the others is not needed
-    adopt = is_certified(position[some], energy[some], slots[candidate[some]], geometry, bounds)
-    return slot.index_put(some, torch.where(adopt.unsqueeze(-1), candidate[some], slot[some]))
+    count = min(EXCHANGES, slot.shape[-1] * len(slots))
+    candidates = best_exchanges(position, energy, slot, slots, geometry, count)
+    # few worlds have an exchange to offer in a step, and few of its kinds
+    some = (candidates != slot.unsqueeze(-2)).any(dim=-1).nonzero(as_tuple=True)
+    world = some[:-1]
+    adopt = torch.zeros(candidates.shape[:-1], dtype=torch.bool, device=slot.device)
+    adopt[some] = is_certified(position[world], energy[world], slots[candidates[some]], geometry, bounds)
+    first = adopt.to(torch.uint8).argmax(dim=-1, keepdim=True)
+    chosen = candidates.gather(-2, first.unsqueeze(-1).expand(*first.shape, slot.shape[-1])).squeeze(-2)
+    return torch.where(adopt.any(dim=-1, keepdim=True), chosen, slot)

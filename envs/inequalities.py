@@ -94,8 +94,8 @@ def _check_battery(world: SurveillanceConfig) -> None:
         return
     if world.diameter < 2 * world.max_speed * world.dt:
         raise ValueError(
-            f"env.arena={world.bounds}: diameter >= 2 max_speed dt fails with {world.diameter:.4g} < "
-            f"{2 * world.max_speed * world.dt:.4g} m, which env.reserve=logarithmic needs. Use env.reserve=linear or shorten env.dt."
+            f"env.reserve=logarithmic: diameter >= 2 max_speed dt fails with {world.diameter:.4g} < "
+            f"{2 * world.max_speed * world.dt:.4g} m for env.arena={world.bounds}. Use env.reserve=linear or shorten env.dt."
         )
     needed = homing.drain_rate / homing.decay * math.log(world.diameter / homing.reserve_radius) + 4 * homing.eps_energy
     if span <= needed:

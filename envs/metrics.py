@@ -78,6 +78,11 @@ class ChargeCounter:
         self.count += reached
         self.counted = self.counted | reached
 
+    def restart(self, energy: Tensor, worlds: Tensor) -> None:
+        """Begin anew in the ``worlds`` ``(*B, 1)`` bool, whose robots now have ``energy`` ``(*B, N)``; the counts stay."""
+        self.start = torch.where(worlds, energy, self.start)
+        self.counted = self.counted & ~worlds
+
 
 class EpisodeTracker:
     """Sums reward and violations per world until its episode ends, and keeps the finished episodes in order."""

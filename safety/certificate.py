@@ -5,8 +5,8 @@ and brings no two robots closer than ``Delta_G``. That set C is invariant under 
 number of robots, so it offers what the set ``{h_c, h_o, h_s >= 0}`` does not: an admissible joint action at each of its
 states.
 
-* :func:`anchors` picks such an action, as little of it as the state demands, and :func:`certified_rows` centres each
-  robot's share of the pairwise constraints on it, so that every robot's own program is feasible.
+* :func:`anchors` picks such an action, as little of it as the state demands; the rows of :mod:`safety.certified_rows`
+  are centred on it, so that every robot's own program is feasible.
 * :func:`shield` steps the world with the programs' actions, checks the very state that the environment will realise
   and replaces failing actions by hold, then by driving home. Invariance rests on it alone: neither on the rows nor on
   the solver.
@@ -15,37 +15,23 @@ Theorems, proofs and their limits: docs/safety.md. Flat batches ``(M, N, ..)`` t
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from envs.dynamics import other_indices, pair_indices
+from envs.dynamics import dot, pair_indices
 from envs.homing import (
-    ClosestMoment,
+    ClosestMoments,
     HomingGeometry,
     certified_pairs,
     certified_robots,
     closest_approach,
-    closest_moment,
+    closest_moments,
     homing_velocity,
 )
-from safety.config import Gains
 
+TINY = 1e-30  # below it a length is 0
 HOLD, HOMING = 1, 2  # levels above 0, the quadratic program
-
-
-class Rows(NamedTuple):
-    """Constraints ``G u <= h`` of every robot's own program, and the action they are centred on."""
-
-    G: Tensor
-    """``(M, N, m, d)``."""
-    h: Tensor
-    """``(M, N, m)``, +inf for no constraint."""
-    anchor: Tensor
-    """Admissible joint action ``(M, N, d)``, m/s."""
-    closest: Tensor
-    """``G_ij (M, P)``, m."""
 
 
 def closest_approach_gradient(
@@ -64,21 +50,28 @@ def closest_approach_gradient(
     Returns:
         ``G (*B, P)`` m, ``dG/dp_i`` and ``dG/dp_j`` ``(*B, P, d)``; pairs in ``torch.triu_indices`` order.
     """
-    moment = closest_moment(position, slot_position, geometry)
-    return moment.distance, *_gradients(moment, position, slot_position)
+    moments = closest_moments(position, slot_position, geometry)
+    least, index = moments.distance.min(dim=0, keepdim=True)
+    gradients = pair_gradients(moments, position, slot_position)
+    wide = index[:, None, None].expand(1, *gradients.shape[1:])
+    first, second = gradients.gather(0, wide).squeeze(0).movedim(1, -1)
+    return least.squeeze(0), first, second
 
 
-def _gradients(moment: ClosestMoment, position: Tensor, slot_position: Tensor) -> tuple[Tensor, Tensor]:
-    pairs = pair_indices(position.shape[-2], position.device)
+def pair_gradients(moments: ClosestMoments, position: Tensor, slot_position: Tensor) -> Tensor:
+    """Gradients of the pieces' distances with respect to i's and to j's position, ``(S, 2, d, *B, P)``."""
+    pair = torch.stack(pair_indices(position.shape[-2], position.device))
+    e = from_slot(position, slot_position).movedim(-1, 0)[..., pair].movedim(-2, 0)  # (2, d, *B, P)
+    normal = (moments.relative / moments.distance.clamp_min(TINY).unsqueeze(1)).unsqueeze(1)  # (S, 1, d, *B, P)
+    along = (moments.slope - moments.share) * (e * normal).sum(2)
+    gradient = moments.share.unsqueeze(2) * normal + along.unsqueeze(2) * e
+    return torch.stack([gradient[:, 0], -gradient[:, 1]], dim=1)
+
+
+def from_slot(position: Tensor, slot_position: Tensor) -> Tensor:
+    """Directions ``e`` from the slots to the robots, 0 in the slot."""
     offset = position - slot_position
-    direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    normal = moment.relative / moment.distance.clamp_min(1e-30).unsqueeze(-1)
-    sides = []
-    for robot, share, slope, sign in zip(pairs, moment.share, moment.slope, (1, -1), strict=True):
-        e = direction[..., robot, :]
-        along = ((slope - share) * (e * normal).sum(-1)).unsqueeze(-1)
-        sides.append(sign * (share.unsqueeze(-1) * normal + along * e))
-    return sides[0], sides[1]
+    return offset / dot(offset, offset).sqrt().clamp_min(TINY).unsqueeze(-1)
 
 
 def anchors(
@@ -110,99 +103,24 @@ def anchors(
     Returns:
         Anchor ``(M, N, d)`` m/s and the slack it leaves ``(M, K, P)``.
     """
-    anchor, slack = torch.zeros_like(position), pair_slack.clone()
-    todo = (chord_bound < 0).any(dim=-1).nonzero().squeeze(-1)  # elsewhere all may stand: their slack is not negative
-    if not len(todo):
-        return anchor, slack
     n = position.shape[1]
     i, j = pair_indices(n, position.device)
-    home = homing_velocity(position[todo], slot_position[todo], geometry)
-    length = chord_normal[todo].norm(dim=-1)
-    critical = chord_bound[todo] < 0
+    home = homing_velocity(position, slot_position, geometry)
+    length = chord_normal.norm(dim=-1).clamp_min(TINY)
+    critical = chord_bound < 0
     # a hair more than the least speed, as the row is met with equality; only limited where C has been left
-    least = (-chord_bound[todo] / length.clamp_min(1e-30) * (1 + 1e-6)).clamp(0, max_speed)
+    least = (-chord_bound / length * (1 + 1e-6)).clamp(0, max_speed)
     speed = torch.maximum(home.norm(dim=-1), least)
-    fast = -chord_normal[todo] / length.clamp_min(1e-30).unsqueeze(-1) * speed.unsqueeze(-1)
+    fast = -chord_normal * (speed / length).unsqueeze(-1)
     homing, moving = torch.where(critical.unsqueeze(-1), fast, home), critical
-    normals, standing = pair_normals[todo], pair_slack[todo]
     for _ in range(n + 1):
         chosen = torch.where(moving.unsqueeze(-1), homing, 0.0)
-        left = standing - _pair_use(normals, chosen, i, j)
-        tight = (left < 0).any(dim=1) & ~(moving[:, i] & moving[:, j])
+        slack = pair_slack - _pair_use(pair_normals, chosen, i, j)
+        tight = (slack < 0).any(dim=1) & ~(moving[:, i] & moving[:, j])
         if not tight.any():
             break
         moving = moving | _either(tight, n, i, j)
-    anchor[todo], slack[todo] = chosen, left
-    return anchor, slack
-
-
-def certified_rows(
-    position: Tensor,
-    slot_position: Tensor,
-    chord_normal: Tensor,
-    chord_bound: Tensor,
-    bounds: Tensor,
-    geometry: HomingGeometry,
-    gains: Gains,
-    *,
-    safety_distance: float,
-    max_speed: float,
-    anchored: bool = True,
-) -> Rows:
-    """Rows of every robot's program: survivability, collision and certificate shared around the anchor, arena.
-
-    Collision (exact over the whole step, as ``h_s`` is convex along it): ``h_s + dt 2 q . (u_i - u_j) >= (1 - g_s) h_s``;
-    certificate (linearised): ``G + dt grad G . u >= Delta_G + eps + (1 - g_G)(G - Delta_G - eps)``. Robot i takes half of
-    what the anchor leaves of each.
-
-    Args:
-        position: ``(M, N, d)``, m.
-        slot_position: ``(M, N, d)``, m.
-        chord_normal: ``(M, N, d)`` and
-        chord_bound: ``(M, N)``, the survivability row (:func:`safety.barriers.sampled_energy_row`).
-        bounds: ``(d, 2)``, the arena, m.
-        geometry: constants of the backup motion.
-        gains: class-K gains.
-        safety_distance: ``Delta``, m.
-        max_speed: m/s.
-        anchored: False centres the rows on standing still, the literature's split by halves (may be infeasible).
-
-    Returns:
-        ``m = 1 + 2 (N - 1) + 2 d`` rows per robot.
-    """
-    (_, n, d), device = position.shape, position.device
-    i, j = pair_indices(n, device)
-    gap = position[:, i] - position[:, j]
-    moment = closest_moment(position, slot_position, geometry)
-    first, second = _gradients(moment, position, slot_position)
-    barrier = gap.square().sum(-1) - safety_distance**2
-    spare = (moment.distance - geometry.clearance - geometry.eps_distance).clamp_min(0)
-    pair_slack = torch.stack([gains.collision * barrier, gains.certificate * spare], dim=1)
-    pair_normals = torch.stack([torch.stack([-2 * gap, 2 * gap], 1), torch.stack([-first, -second], 1)], dim=1)
-    if anchored:
-        layout = (chord_normal, chord_bound, position, slot_position)
-        anchor, slack = anchors(*layout, pair_normals, pair_slack, geometry, max_speed)
-    else:
-        anchor, slack = torch.zeros_like(position), pair_slack
-    # robot i's side of its N - 1 pairs: side 0 of pair (i, j), side 1 of pair (j, i)
-    others = other_indices(n, device)
-    robots = torch.arange(n, device=device).unsqueeze(-1)
-    number = torch.zeros(n, n, dtype=torch.int64, device=device)
-    number[i, j] = number[j, i] = torch.arange(len(i), device=device)
-    pair = number[robots, others]
-    side = (robots > others).to(torch.int64) * len(i) + pair
-    normals = pair_normals.flatten(2, 3)[:, :, side]  # (M, 2, N, N - 1, d)
-    shares = slack.clamp_min(0)[:, :, pair] / 2 + (normals * anchor[:, None, :, None]).sum(-1)
-    walls = torch.cat(
-        [torch.eye(d, dtype=position.dtype, device=device), -torch.eye(d, dtype=position.dtype, device=device)]
-    )
-    room = torch.cat([bounds[:, 1] - position, position - bounds[:, 0]], dim=-1).clamp_min(0) / geometry.dt
-    return Rows(
-        G=torch.cat([chord_normal.unsqueeze(2), normals[:, 0], normals[:, 1], walls.expand(*room.shape, d)], dim=2),
-        h=torch.cat([chord_bound.unsqueeze(-1), shares[:, 0], shares[:, 1], room], dim=-1),
-        anchor=anchor,
-        closest=moment.distance,
-    )
+    return chosen, slack
 
 
 def outside(

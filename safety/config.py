@@ -48,7 +48,7 @@ class SafetyConfig:
     alpha_s: float | None = None
     """Class-K gain of the collision barrier, 1/s, (0, 1/dt]; null = 1/dt (0.5/dt with split=full)."""
     alpha_g: float | None = None
-    """Class-K gain of the homing certificate, 1/s, (0, 1/dt]; null = 0.5/dt. certified only."""
+    """Class-K gain of the homing certificate far from its limit, 1/s, (0, 1/dt]; null = 1/dt. certified only."""
     solver: str = "auto"
     """auto: exact for one robot's problem, qpth for the joint one. exact | qpth choose."""
     in_loss: bool = False
@@ -89,7 +89,7 @@ class SafetyConfig:
             ValueError: if a gain is outside ``(0, 1/dt]``, where a sampled barrier may jump below zero, or does not fit
                 the world's certificate (docs/safety.md, inequalities 1, 4 and 6).
         """
-        defaults = {"alpha_c": 0.2, "alpha_o": 0.5, "alpha_s": 0.5 if self.split == "full" else 1.0, "alpha_g": 0.5}
+        defaults = {"alpha_c": 0.2, "alpha_o": 0.5, "alpha_s": 0.5 if self.split == "full" else 1.0, "alpha_g": 1.0}
         values = []
         for name, share in defaults.items():
             value = getattr(self, name)

@@ -35,7 +35,8 @@ from safety.barriers import (
     overcharge_barrier,
     sampled_energy_row,
 )
-from safety.certificate import HOLD, HOMING, certified_rows, outside, pair_minimum, shield
+from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
+from safety.certified_rows import certified_rows
 from safety.config import SafetyConfig
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
 from safety.speed_faces import speed_faces
@@ -176,6 +177,7 @@ class SafetyFilter(TensorDictModuleBase):
             anchored=self.safety.split != "half",
         )
         action, status, residual = self._solve_per_robot(target, rows.G, rows.h)
+        action = limit_speed(action, world.max_speed)  # as the environment will: the shield trusts no solver
         status = torch.where(finite, status, int(QPStatus.INACCURATE))
         beyond = outside(position, energy, home, rows.closest, geometry, bounds)
         level = torch.where(status == QPStatus.SOLVED, 0, HOLD)

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from envs.dynamics import dot
 from safety.kkt import SCALE_FLOOR, TINY, QPStatus, Raw, column_norm, kkt_residual, norm, normalise_rows, pivoted_basis
 
 EARLY_STOP = 1e-12
@@ -205,7 +206,7 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
         tol: KKT tolerance.
     """
     raw, m = Raw.blank(t, G.shape[1]), G.shape[1]
-    outside = ((G * t[:, None]).sum(-1) > h).any(-1)
+    outside = (dot(G, t[:, None]) > h).any(-1)
     if radius is not None:
         outside = outside | (norm(t) > radius)
     index = outside.nonzero()[:, 0]

@@ -1,5 +1,7 @@
 """What the filter did, summed over a run: the block ``filter`` of summary.json and of eval.json."""
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -32,6 +34,7 @@ class FilterStatistics:
             0.0,
         )
         self.max_residual = 0.0
+        self.least_certificate = math.inf
 
     def update(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> None:
         """Take in filter outputs of any batch shape.
@@ -58,10 +61,15 @@ class FilterStatistics:
         for name, total in zip(self.sums, totals.tolist(), strict=True):
             self.sums[name] += total
         self.max_residual = max(self.max_residual, float(largest))
+        gap = tensordict.get(keys.BARRIER_CERTIFICATE, None)
+        if gap is not None:
+            least = torch.where(counts, gap.squeeze(-1), torch.inf).min()
+            self.least_certificate = min(self.least_certificate, float(least))
 
     def summary(self) -> dict[str, float]:
         """Rates per robot-step, counts in robot-steps, mean correction in m/s, largest residual of an executed solution."""
         steps = max(self.sums["robot_steps"], 1.0)
+        certificate = {"min_certificate_margin": self.least_certificate}
         return {
             "intervention_rate": self.sums["interventions"] / steps,
             "mean_correction": self.sums["correction"] / steps,
@@ -71,4 +79,5 @@ class FilterStatistics:
             "inaccurate": int(self.sums["inaccurate"]),
             "outside": int(self.sums["outside"]),
             "max_residual": self.max_residual,
+            **(certificate if math.isfinite(self.least_certificate) else {}),  # smallest G - Delta_G, m
         }

@@ -486,9 +486,9 @@ def test_configuration_that_cannot_be_is_refused(fields, message):
 
 def test_default_gains_follow_the_step():
     world = make_world(dt=0.1)
-    assert SafetyConfig(mode="paper").gains(world) == pytest.approx((2, 5, 10, 5))
-    assert SafetyConfig(mode="paper", split="full").gains(world) == pytest.approx((2, 5, 5, 5))
-    assert SafetyConfig(mode="paper", alpha_s=3.0).gains(world) == pytest.approx((2, 5, 3, 5))
+    assert SafetyConfig(mode="paper").gains(world) == pytest.approx((2, 5, 10, 10))
+    assert SafetyConfig(mode="paper", split="full").gains(world) == pytest.approx((2, 5, 5, 10))
+    assert SafetyConfig(mode="paper", alpha_s=3.0).gains(world) == pytest.approx((2, 5, 3, 10))
 
 
 # ---- in the world ----------------------------------------------------------------------------------------------------

@@ -27,6 +27,8 @@ VARIANTS = {
     "shared gradient": ("agent.gradient=shared", "agent.share_params=true"),
     "own minibatches, OU noise": ("agent.minibatch=per_agent", "agent.noise=ou"),
     "violation penalty": ("safety=none", "train.violation_penalty=1.0", "env.on_violation=continue"),
+    "adversary": ("experiment=adversary",),
+    "adversary of one robot behind the literal filter": ("train.objective=adversary", "safety=paper", "env.n_agents=1"),
     "aerial": ("env=aerial",),
     "five robots, float64": ("env=five_robots", "env.dtype=float64"),
     "density per world": ("env=random_density",),
