@@ -23,6 +23,8 @@ class Rows(NamedTuple):
     """Admissible joint action ``(M, N, d)``, m/s."""
     closest: Tensor
     """``G_ij (M, P)``, m."""
+    distance: Tensor
+    """Present distance of the pairs, ``(M, P)``, m."""
 
 
 def certified_rows(
@@ -85,6 +87,7 @@ def certified_rows(
         h=torch.cat([chord_bound.unsqueeze(-1), shares, room], dim=-1),
         anchor=anchor,
         closest=later.amin(dim=0),
+        distance=now,
     )
 
 

@@ -52,7 +52,8 @@ class SafetyFilter(TensorDictModuleBase):
       ``(*B, N, 1)`` = ||u - u^|| with u^ first cut to the speed ball, status and level ``(*B, N)`` int64, residual
       and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``, outside ``(*B, N)`` bool: a state that
       the filter makes no promise for (certified: not in the certified set, the robot drives home; paper: a barrier is
-      negative). certified also writes h_g = G - Delta_G (smallest over the pairs) ``(*B, N, 1)``.
+      negative). h_c takes the filter's own reserve. certified also writes h_g = G - Delta_G ``(*B, N, 1)``, the
+      smallest over the pairs.
 
     A non-finite nominal action is replaced by hold, flagged INACCURATE and counted, as a correction of max_speed.
 
@@ -108,55 +109,47 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             The tensors of ``out_keys``.
         """
-        field = self._field(position)
-        h_c, h_o, h_s = self._barriers(position, energy, slot, field)
         cut = limit_speed(nominal, self.world.max_speed)
         finite = nominal.isfinite().all(dim=-1)
         target = torch.where(finite.unsqueeze(-1), cut, 0.0)
-        values = [h_c.value.unsqueeze(-1), h_o.value.unsqueeze(-1), h_s.value.amin(dim=-1, keepdim=True)]
-        beyond = ~(torch.cat(values, dim=-1) >= 0).all(dim=-1)
-        if self.safety.mode == "none":
-            action, current = cut, torch.ones_like(energy)
-            status = level = torch.zeros_like(slot)
-            residual = torch.zeros_like(energy)
-        elif self.safety.mode == "certified":
-            action, current, status, residual, level, beyond, gap = self._certified(
-                target, finite, position, energy, slot, field, h_o
+        if self.safety.mode == "certified":
+            action, current, status, residual, level, *diagnostics = self._certified(
+                target, finite, position, energy, slot
             )
         else:
-            action, current, status, residual = self._program(target, position, energy, slot, h_c, h_o, h_s)
-            status = torch.where(finite, status, int(QPStatus.INACCURATE))
-            hold = status != QPStatus.SOLVED
-            action = torch.where(hold.unsqueeze(-1), 0.0, action)
-            level = hold.to(torch.int64)
+            h_c, h_o, h_s = self._barriers(position, energy, slot)
+            diagnostics = [h_c.value, h_o.value, h_s.value.amin(dim=-1)]
+            diagnostics.append(~(torch.stack(diagnostics) >= 0).all(dim=0))
+            if self.safety.mode == "none":
+                action, current = cut, torch.ones_like(energy)
+                status = level = torch.zeros_like(slot)
+                residual = torch.zeros_like(energy)
+            else:
+                action, current, status, residual = self._program(target, position, energy, slot, h_c, h_o, h_s)
+                status = torch.where(finite, status, int(QPStatus.INACCURATE))
+                hold = status != QPStatus.SOLVED
+                action = torch.where(hold.unsqueeze(-1), 0.0, action)
+                level = hold.to(torch.int64)
         # the gradient of the norm at 0 is 0, not NaN
         difference = (action - cut).nan_to_num()
         squared = difference.square().sum(-1, keepdim=True)
         correction = torch.where(squared > 0, squared.clamp_min(torch.finfo(squared.dtype).tiny).sqrt(), 0.0)
         correction = torch.where(finite.unsqueeze(-1), correction, self.world.max_speed)
-        certificate = (gap.unsqueeze(-1),) if self.safety.mode == "certified" else ()
-        return (
-            *(action, current.unsqueeze(-1), correction, status, level, residual.unsqueeze(-1)),
-            *values,
-            beyond,
-            *certificate,
-        )
+        outputs = (action, current, correction.squeeze(-1), status, level, residual, *diagnostics)
+        whole = (keys.ACTION, keys.STATUS, keys.LEVEL, keys.OUTSIDE)
+        return tuple(x if key in whole else x.unsqueeze(-1) for key, x in zip(self.out_keys, outputs, strict=True))
 
     def _certified(
-        self,
-        target: Tensor,
-        finite: Tensor,
-        position: Tensor,
-        energy: Tensor,
-        slot: Tensor,
-        field: Tensor,
-        h_o: BarrierRow,
+        self, target: Tensor, finite: Tensor, position: Tensor, energy: Tensor, slot: Tensor
     ) -> tuple[Tensor, ...]:
-        """Programs and shield: ``(action, current, status, residual, level, outside, G - Delta_G)``."""
+        """Programs and shield: ``(action, current, status, residual, level, h_c, h_o, h_s, outside, h_g)``."""
         world, geometry, shape = self.world, self.geometry, target.shape
         stations, slots, bounds = self._layout(position)
         step = functools.partial(transition, stations=stations, config=world)
-        current, _ = accepted_current(h_o._replace(value=h_o.value - geometry.eps_energy), self.gains.overcharge)
+        field = self._field(position)
+        rates = {"drain_rate": world.drain_rate, "charge_rate": world.charge_rate}
+        h_o = overcharge_barrier(energy, field, energy_max=world.energy_max - geometry.eps_energy, **rates)
+        current, _ = accepted_current(h_o, self.gains.overcharge)
         # standing still drains least: no action may lift the energy over its limit, not even by a rounding
         rest = torch.full_like(energy, world.drain_rate)
         fullest = charge(energy, field, current, rest, charge_rate=world.charge_rate, dt=world.dt)
@@ -165,7 +158,7 @@ class SafetyFilter(TensorDictModuleBase):
         flat = [x.reshape(-1, *shape[-2:]) for x in (target, position, slots[slot])]
         flat += [x.reshape(-1, shape[-2]) for x in (energy, next_energy, current, finite)]
         target, position, home, energy, next_energy, flat_current, finite = flat
-        _, normal, bound = sampled_energy_row(
+        h_c, normal, bound = sampled_energy_row(
             *(position, energy, next_energy, home, geometry),
             gain=self.gains.energy * world.dt,
             step=world.max_speed * world.dt,
@@ -186,9 +179,15 @@ class SafetyFilter(TensorDictModuleBase):
             *(step, position, energy, home, action, flat_current, level, rows.closest, geometry, bounds),
             max_speed=world.max_speed,
         )
-        gap = pair_minimum(rows.closest, shape[-2]) - geometry.clearance
-        per_robot = (x.reshape(shape[:-1]) for x in (status, residual, level, beyond, gap))
-        return action.reshape(shape), current, *per_robot
+        least = pair_minimum(torch.cat([rows.closest, rows.distance]), shape[-2])
+        closest, distance = least[: len(energy)], least[len(energy) :]
+        values = (
+            h_c + 2 * geometry.eps_energy,
+            world.energy_max - energy,
+            distance.square() - world.safety_distance**2,
+        )
+        flat = (status, residual, level, *values, beyond, closest - geometry.clearance)
+        return action.reshape(shape), current, *(x.reshape(shape[:-1]) for x in flat)
 
     def _program(
         self,
@@ -304,7 +303,7 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             ``(*B, N, d)``, m/s.
         """
-        h_c, h_o, h_s = self._barriers(position, energy, slot, self._field(position))
+        h_c, h_o, h_s = self._barriers(position, energy, slot)
         alpha_c, alpha_o, alpha_s, _ = self.gains
         current, _ = accepted_current(h_o, alpha_o)
         bound_c = h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
@@ -317,11 +316,9 @@ class SafetyFilter(TensorDictModuleBase):
         radii = {"full_radius": self.world.charge_radius_full, "zero_radius": self.world.charge_radius}
         return charging_field(position, self._layout(position)[0], **radii)
 
-    def _barriers(
-        self, position: Tensor, energy: Tensor, slot: Tensor, field: Tensor
-    ) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
-        """Rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
-        world = self.world
+    def _barriers(self, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
+        """The literature's rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
+        world, field = self.world, self._field(position)
         slots = self._layout(position)[1]
         rates = {"charge_rate": world.charge_rate}
         return (

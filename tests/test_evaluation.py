@@ -163,3 +163,22 @@ def test_record_is_the_first_world(density):
     assert len(history.density) == (30 if density == "age" else 1)
     assert history.density.sum(-1) == pytest.approx(1, abs=1e-5)
     assert history.dt == pytest.approx(world.dt)
+
+
+def test_restarted_worlds_go_on_counting():
+    world, steps = SurveillanceConfig(), 80
+    once, _, _ = evaluate_policy(SurveillanceEnv(world, B, seed=5), policy_of("flee", world, mode="none"), steps)
+    seen = []
+
+    def check(td, alive):
+        assert alive.all()
+        seen.append(td["next", "terminated"].clone())
+        if len(seen) > 1:  # a world that ended stands at a fresh start, the others go on
+            assert ((td[keys.STEP_COUNT] == 0) == seen[-2]).all()
+
+    policy = policy_of("flee", world, mode="none")
+    again, _, _ = evaluate_policy(SurveillanceEnv(world, B, seed=5), policy, steps, restart=True, check=check)
+    assert len(seen) == steps
+    assert once["robot_steps"] < again["robot_steps"] == B * steps * N
+    assert again["terminated_worlds"] == int(sum(ended.sum() for ended in seen)) > once["terminated_worlds"]
+    assert sum(again["violations"].values()) > sum(once["violations"].values())

@@ -8,6 +8,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import evaluate
 import train
+from envs import SurveillanceConfig
+from envs.inequalities import derived_quantities
 
 TINY = (
     *("collector.num_envs=4", "collector.steps_per_batch=2", "collector.total_frames=64", "buffer.batch_size=8"),
@@ -151,6 +153,28 @@ def test_a_sweep_of_controllers_writes_under_runs_only(program, tmp_path):
     assert code == 0, output
     assert len(list(tmp_path.glob("runs/controllers/*/eval.json"))) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_killed_sweep_of_controllers_goes_on(program, tmp_path):
+    sweep = ("-m", "controller=random,lloyd", "steps=3", "num_envs=2", "pictures=false", "resume=auto")
+    program(evaluate.main, *sweep)
+    first, second = sorted(tmp_path.glob("runs/controllers/*/eval.json"))
+    second.unlink()
+    stamp = first.stat().st_mtime_ns
+    code, output = program(evaluate.main, *sweep)
+    assert code == 0, output
+    assert second.is_file()
+    assert first.stat().st_mtime_ns == stamp
+    assert "nothing to do" in output
+
+
+def test_run_folder_holds_the_certificate(program, tmp_path):
+    code, output = program(train.main, *TINY)
+    assert code == 0, output
+    (path,) = tmp_path.glob("runs/*/*/certificate.json")
+    certificate = json.loads(path.read_text())
+    assert certificate == pytest.approx(derived_quantities(SurveillanceConfig(horizon=6)))
+    assert f"clearance {certificate['clearance']:.4g}" in output
 
 
 def test_a_bad_job_of_a_multirun_leaves_the_others_alone(program, tmp_path):
