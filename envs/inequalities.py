@@ -28,9 +28,9 @@ def check_inequalities(world: SurveillanceConfig) -> None:
     """
     _check_layout(world)
     _check_charging(world)
+    _check_rounding(world)
     _check_spacing(world)
     _check_battery(world)
-    _check_rounding(world)
 
 
 def _check_layout(world: SurveillanceConfig) -> None:
