@@ -26,10 +26,10 @@ from agents.incident import check_violations
 from agents.networks import make_actor
 from agents.pipeline import pick_device
 from conf.callbacks import one_clear_error
-from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config, write_json
+from conf.run_folder import announce_certificate, finished_evaluation, write_json
+from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
-from envs.inequalities import derived_quantities
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
 from safety import SafetyConfig, SafetyFilter
 
@@ -44,9 +44,6 @@ def main(cfg: DictConfig) -> None:
     config: EvaluateConfig = to_config(cfg)
     device = pick_device(config.device)
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if config.resume == "auto" and (folder / "eval.json").is_file():  # a job of a multirun
-        tqdm.write(f"{folder}/eval.json exists: nothing to do. resume=never evaluates anew.")
-        return
     env_seed, controller_seed = np.random.SeedSequence(config.seed).generate_state(2).tolist()
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
@@ -62,6 +59,19 @@ def main(cfg: DictConfig) -> None:
         nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
     policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
     steps = config.steps or rollout_steps(world.horizon)
+    asked = {
+        "steps": steps,
+        "num_envs": config.num_envs,
+        "restart": config.restart,
+        "seed": config.seed,
+        "policy": name,
+    }
+    if config.resume == "auto" and finished_evaluation(folder / "eval.json", asked):
+        tqdm.write(f"{folder}/eval.json exists: nothing to do. resume=never evaluates anew.")
+        return
+    for old in ("eval.json", "violation.json"):
+        (folder / old).unlink(missing_ok=True)
+    announce_certificate(folder, world)
     check = functools.partial(check_violations, world=world, safety=safety, folder=folder)
     start = time.perf_counter()
     metrics, statistics, trajectory = evaluate_policy(
@@ -72,11 +82,7 @@ def main(cfg: DictConfig) -> None:
         "filter": statistics,
         "task": {} if isinstance(source, Config) else nominal.metrics(),
         "wall_time_s": time.perf_counter() - start,
-        "certificate": derived_quantities(world),
-        "steps": steps,
-        "num_envs": config.num_envs,
-        "seed": config.seed,
-        "policy": name,
+        **asked,
         "adversary": config.adversary,
         "git_hash": git_hash(),
         "env": asdict(world),

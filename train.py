@@ -26,10 +26,10 @@ from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
-from conf.schema import Config, config_hash, finished_run, register, rollout_steps, to_config, write_json
+from conf.run_folder import announce_certificate, finished_run, write_json
+from conf.schema import Config, config_hash, register, rollout_steps, to_config
 from conf.versions import git_hash, package_versions
 from envs import SurveillanceEnv, keys
-from envs.inequalities import derived_quantities
 from envs.rendering import save_training_curve
 
 register()
@@ -65,9 +65,7 @@ def main(cfg: DictConfig) -> None:
     writer = SummaryWriter(str(folder))
     adversary = config.adversary_reward()
     check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
-    certificate = derived_quantities(config.env)
-    write_json(folder / "certificate.json", certificate)
-    tqdm.write("certificate: " + ", ".join(f"{name} {value:.4g}" for name, value in certificate.items()))
+    announce_certificate(folder, config.env)
 
     def log(scalars: dict[str, float]) -> None:
         for tag, value in scalars.items():

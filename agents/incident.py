@@ -43,7 +43,7 @@ def check_violations(
     safety: SafetyConfig,
     folder: Path,
 ) -> None:
-    """Stop at the first violation of a certified run, after writing ``folder/violation.json``.
+    """Stop a certified run at its first violation, or state outside the certified set, after writing ``violation.json``.
 
     Args:
         tensordict: transitions of any batch shape.
@@ -57,7 +57,8 @@ def check_violations(
     """
     if safety.mode != "certified":
         return
-    flags = torch.stack([tensordict["next"][(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS], -1)
+    flags = [tensordict["next"][(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
+    flags = torch.stack([*flags, tensordict[keys.OUTSIDE]], -1)
     if alive is not None:
         flags = flags & alive.unsqueeze(-1)
     if not flags.any():
@@ -65,7 +66,7 @@ def check_violations(
     first = tuple(flags.flatten(-2).any(dim=-1).nonzero()[0].tolist())
     row, flags = tensordict[first], flags[first]
     path = save_incident(folder / "violation.json", row, world, safety)
-    kinds = [kind for k, kind in enumerate(keys.VIOLATION_KINDS) if flags[:, k].any()]
+    kinds = [kind for k, kind in enumerate((*keys.VIOLATION_KINDS, "left the certified set")) if flags[:, k].any()]
     raise ViolationError(
         f"{', '.join(kinds)} behind the certified filter, which must not happen: please report it. The state that caused it "
         f"is in {path}; agents.incident.replay computes the step again, a copy in tests/violations/ is tested from then on."

@@ -18,7 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 from agents.checkpoint import CheckpointError
 from agents.incident import ViolationError
 from agents.maddpg import DivergedError
-from conf.schema import check_evaluation, finished_run, to_config
+from conf.run_folder import finished_run
+from conf.schema import check_evaluation, to_config
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 EXPECTED_IN_RUN = (

@@ -254,6 +254,8 @@ def to_config(cfg: DictConfig) -> Any:
     own = cfg.copy()
     with open_dict(own):
         own.pop("hydra", None)
+    if "run" in own and own.run is not None:  # world and filter are the run's: run_config applies the overrides to them
+        own.env, own.safety = OmegaConf.structured(SurveillanceConfig), OmegaConf.structured(SafetyConfig)
     return OmegaConf.to_object(own)
 
 
@@ -323,17 +325,3 @@ def evaluation_folder(cfg: DictConfig) -> str:
 def rollout_steps(horizon: int) -> int:
     """Length of an evaluation that gives none: one episode, or 1000 steps where episodes do not end."""
     return horizon or 1000
-
-
-def finished_run(folder: Path, resume: str | None) -> str | None:
-    """What to tell the user if ``folder`` holds a finished run that is to be left alone; None otherwise."""
-    if resume != "auto" or not (folder / "summary.json").is_file():
-        return None
-    return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
-
-
-def write_json(path: Path, content: dict) -> None:
-    """Write ``content`` indented, complete or not at all; a NaN or infinity raises ``ValueError``."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    temporary.replace(path)

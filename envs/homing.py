@@ -8,7 +8,7 @@ no robot runs empty and no two robots come closer than ``clearance``:
 
 The set is invariant under the joint backup motion; keeping every robot inside it is what a certified filter does.
 Source: Notomista & Egerstedt, Persistification of Robotic Tasks (arXiv 1903.05810) for the reserve; the closest
-approach ``G`` of the exact piecewise linear paths is this project's (../docs/safety.md once the certified filter lands).
+approach ``G`` of the exact piecewise linear paths is this project's (docs/safety.md).
 """
 
 import math
@@ -21,7 +21,7 @@ from torch import Tensor
 from envs.dynamics import dot, pair_indices
 
 TINY = 1e-30  # below it a length is 0
-EXCHANGES = 8  # exchanges of slots whose certificate is tried in a step; an exchange of two robots comes twice
+EXCHANGES = 4  # exchanges of slots whose certificate is tried in a step
 
 
 @dataclass(frozen=True)
@@ -307,9 +307,10 @@ def best_exchanges(
     owner_way = own_way.squeeze(-1).gather(-1, owner_of).unsqueeze(-2)
     zero = torch.zeros((), dtype=way.dtype, device=way.device)
     gain = own_way - cost + torch.where(taken, owner_way - cross, zero)
-    best, index = gain.nan_to_num(nan=-torch.inf).flatten(-2).topk(count, dim=-1)
-    robot, target = index // n_slots, (index % n_slots).unsqueeze(-1)
     robots = torch.arange(slot.shape[-1], device=slot.device)
+    twice = taken & (owner_of.unsqueeze(-2) < robots.unsqueeze(-1))  # an exchange of two robots counts once
+    best, index = gain.nan_to_num(nan=-torch.inf).masked_fill(twice, -torch.inf).flatten(-2).topk(count, dim=-1)
+    robot, target = index // n_slots, (index % n_slots).unsqueeze(-1)
     old = slot.gather(-1, robot).unsqueeze(-1)
     swapped = torch.where(slot.unsqueeze(-2) == target, old, slot.unsqueeze(-2))
     swapped = torch.where(robots == robot.unsqueeze(-1), target, swapped)

@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, pair_indices
+from envs.dynamics import dot, limit_speed, pair_indices
 from envs.homing import (
     ClosestMoments,
     HomingGeometry,
@@ -174,7 +174,9 @@ def shield(
     n = position.shape[1]
     pairs = torch.stack(pair_indices(n, position.device), dim=-1)
     level, rounds = level.clone(), torch.zeros_like(level[:, 0])
-    home = homing_velocity(position, slot_position, geometry)
+    # as the environment will cut it, far outside the arena in the logarithmic family
+    home = limit_speed(homing_velocity(position, slot_position, geometry), max_speed)
+    home = torch.where(home.isfinite(), home, 0.0)
     chosen = _by_level(action, home, level)
     reach = geometry.clearance + geometry.eps_distance + 2 * max_speed * geometry.dt
     worlds, near = (~(closest >= reach)).nonzero(as_tuple=True)

@@ -8,8 +8,9 @@ with the accepted current ``c`` in closed form (nominal current 1; more current 
 ever relaxed: a problem without solution, or one the solver could not solve to its tolerance, falls to **hold**
 (``u = 0``) and is flagged in ("filter", "status"). The nominal action is never executed unfiltered.
 
-* ``mode=certified``: rows and shield of :mod:`safety.certificate`. From a certified state the next state is certified,
-  whatever the nominal action and the solver: ("filter", "level") tells who decided, 0 the program, 1 hold, 2 homing.
+* ``mode=certified``: rows of :mod:`safety.certified_rows`, shield of :mod:`safety.certificate`. From a certified state
+  the next state is certified, whatever the nominal action and the solver: ("filter", "level") tells who decided, 0 the
+  program, 1 hold, 2 homing.
 * ``mode=paper``: the rows are the literature's and hold is the last resort, so holding, another robot or the length of a
   step can still lead to a violation; the environment counts those.
 """
@@ -61,8 +62,10 @@ class SafetyFilter(TensorDictModuleBase):
         safety: which filter.
         world: the world it stands in.
 
+    The position's type and device are the filter's; other inputs are converted to its type.
+
     Raises:
-        ValueError: if a gain does not fit the world's time step.
+        ValueError: if a gain does not fit the world's time step, or the world's certificate.
         KeyError: from ``forward``, if an input key is missing.
     """
 
@@ -109,9 +112,9 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             The tensors of ``out_keys``.
         """
-        cut = limit_speed(nominal, self.world.max_speed)
+        nominal, energy = nominal.to(position.dtype), energy.to(position.dtype)
         finite = nominal.isfinite().all(dim=-1)
-        target = torch.where(finite.unsqueeze(-1), cut, 0.0)
+        target = limit_speed(torch.where(finite.unsqueeze(-1), nominal, 0.0), self.world.max_speed)
         if self.safety.mode == "certified":
             action, current, status, residual, level, *diagnostics = self._certified(
                 target, finite, position, energy, slot
@@ -121,7 +124,8 @@ class SafetyFilter(TensorDictModuleBase):
             diagnostics = [h_c.value, h_o.value, h_s.value.amin(dim=-1)]
             diagnostics.append(~(torch.stack(diagnostics) >= 0).all(dim=0))
             if self.safety.mode == "none":
-                action, current = cut, torch.ones_like(energy)
+                action = target = limit_speed(nominal, self.world.max_speed)
+                current = torch.ones_like(energy)
                 status = level = torch.zeros_like(slot)
                 residual = torch.zeros_like(energy)
             else:
@@ -131,8 +135,7 @@ class SafetyFilter(TensorDictModuleBase):
                 action = torch.where(hold.unsqueeze(-1), 0.0, action)
                 level = hold.to(torch.int64)
         # the gradient of the norm at 0 is 0, not NaN
-        difference = (action - cut).nan_to_num()
-        squared = difference.square().sum(-1, keepdim=True)
+        squared = (action - target).square().sum(-1, keepdim=True)
         correction = torch.where(squared > 0, squared.clamp_min(torch.finfo(squared.dtype).tiny).sqrt(), 0.0)
         correction = torch.where(finite.unsqueeze(-1), correction, self.world.max_speed)
         outputs = (action, current, correction.squeeze(-1), status, level, residual, *diagnostics)

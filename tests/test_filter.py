@@ -561,3 +561,32 @@ def test_literal_filter_violates():
     assert violations["collision"] > 10
     assert violations["overcharged"] > 10
     assert statistics["infeasible"] > 0
+
+
+@pytest.mark.parametrize("mode", ["certified", "paper"])
+@pytest.mark.parametrize(
+    ("of", "dtype"), [(0, torch.float64), (0, torch.int64), (0, torch.float16), (2, torch.float64)]
+)
+def test_other_number_types_are_converted_to_the_positions(mode, of, dtype):
+    world = make_world()
+    inputs = list(random_inputs(world, 4))
+    inputs[0] = inputs[0].round() if dtype == torch.int64 else inputs[0]
+    expected = run(world, inputs, mode=mode)
+    inputs[of] = inputs[of].to(dtype)
+    got = run(world, inputs, mode=mode)
+    assert got["action"].dtype == torch.float32
+    tolerance = 1e-3 if dtype == torch.float16 else 0
+    torch.testing.assert_close(got["action"], expected["action"], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("mode", ["certified", "paper"])
+def test_nan_nominal_action_has_no_nan_gradient(mode):
+    world = make_world()
+    nominal, *rest = random_inputs(world, 4)
+    nominal[0, 0] = math.nan
+    nominal.requires_grad_()
+    f = SafetyFilter(SafetyConfig(mode=mode), world)
+    action, _, correction, *_ = f.filter(nominal, *rest)
+    (action.square().sum() + correction.square().sum()).backward()
+    assert nominal.grad.isfinite().all()
+    assert (nominal.grad[0, 0] == 0).all()

@@ -512,6 +512,20 @@ def test_reassignment_is_adopted_exactly_where_certified(n_slots):
     assert got.sort(-1).values.diff(dim=-1).gt(0).all()
 
 
+@pytest.mark.parametrize("n_slots", [4, 6])
+def test_best_exchanges_are_different_ones(n_slots):
+    g, rng = world(n_agents=4).homing, np.random.default_rng(5)
+    slots, slot = tensor(rng.uniform(-1, 1, (n_slots, 2))), random_assignment(rng, 200, 4, n_slots)
+    position, energy = tensor(rng.uniform(-1, 1, (200, 4, 2))), torch.full((200, 4), 1.0, dtype=torch.float64)
+    several = best_exchanges(position, energy, slot, slots, g, EXCHANGES)
+    way = (position.unsqueeze(1) - slots[several]).square().sum((-1, -2))
+    assert (way.diff(dim=-1) >= -1e-12).all()  # best first
+    for i in range(EXCHANGES):
+        for j in range(i):
+            same = (several[:, i] == several[:, j]).all(-1)
+            assert (several[:, i][same] == slot[same]).all()  # only "no change" comes more than once
+
+
 def test_geometry_is_frozen_and_derived():
     g = world().homing
     assert g.speed == pytest.approx(0.196)

@@ -32,8 +32,16 @@ REFUSED = {
     "1 alpha dt <= 1": ({"dt": 0.1}, {"alpha_g": 10.1}, r"safety\.alpha_g=10\.1 .*\(0, 10"),
     "2 K_c > P": ({"charge_rate": 0.06}, {}, r"env\.charge_rate=0\.06: K_c > P\(max_speed\) fails.*0\.06"),
     "2 r_rho >= 2U": ({"dt": 0.5}, {}, r"env\.charge_radius=0\.24: r_rho >= 2 max_speed dt fails.*0\.2 m"),
-    "4 least clearance": ({"homing_clearance": 0.13}, {}, r"env\.homing_clearance=0\.13: Delta_G\^2 >= .* at least 0\.1447 m"),
-    "4 clearance of the gain": ({}, {"alpha_s": 2.5}, r"safety\.alpha_s=2\.5: Delta_G\^2 >= .*0\.1447 < 0\.2004 m.*null \(5\)"),
+    "4 least clearance": (
+        {"homing_clearance": 0.13},
+        {},
+        r"env\.homing_clearance=0\.13: Delta_G\^2 >= .* at least 0\.1447 m",
+    ),
+    "4 clearance of the gain": (
+        {},
+        {"alpha_s": 2.5},
+        r"safety\.alpha_s=2\.5: Delta_G\^2 >= .*0\.1447 < 0\.2004 m.*null \(5\)",
+    ),
     "5 fewer slots": ({"n_agents": 2, "stations": [[0, 0]]}, {}, r"1 slots for env\.n_agents=2 robots"),
     "5 slots too close": (
         {"n_agents": 2, "stations": [[0, 0], [0.14, 0]]},
@@ -43,7 +51,11 @@ REFUSED = {
     "5 slot outside": ({"n_agents": 1, "stations": [[0, 2]]}, {}, r"outside env\.arena"),
     "6 battery of a step": ({"energy_max": 0.11}, {}, r"E_max - E_min > 3 eps_E \+ P dt fails"),
     "6 throttled charging": (POWER, {"alpha_o": 0.04}, r"safety\.alpha_o=0\.04 throttles .*Raise it above"),
-    "6 logarithmic battery": ({"reserve": "logarithmic"}, {}, r"env\.reserve=logarithmic: E_max - E_min > .*env\.drain_rate="),
+    "6 logarithmic battery": (
+        {"reserve": "logarithmic"},
+        {},
+        r"env\.reserve=logarithmic: E_max - E_min > .*env\.drain_rate=",
+    ),
     "9 rounding of distances": (
         {"arena": [[0, 1], [1e5, 1e5 + 1]]},
         {},
@@ -95,7 +107,9 @@ def test_derived_quantities_are_the_geometry():
 def test_a_charger_carries_the_full_drain_inside_the_slots_charging_radius():
     """Section 1: the radius is measured from the slot, the field from the station."""
     for slots, power in itertools.product((1, 3), ({}, POWER)):
-        world = SurveillanceConfig(stations=[[0.0, 0.0], [0.7, 0.7], [-0.7, 0.7]], slots=slots, charge_radius=0.35, **power)
+        world = SurveillanceConfig(
+            stations=[[0.0, 0.0], [0.7, 0.7], [-0.7, 0.7]], slots=slots, charge_radius=0.35, **power
+        )
         stations, places = (torch.tensor(x, dtype=F64) for x in (world.station_positions, world.slot_positions))
         gen = torch.Generator().manual_seed(slots)
         offset = torch.randn(4000, len(places), 2, generator=gen, dtype=F64)
@@ -120,7 +134,11 @@ def test_lemma_6_closest_approach_of_the_logarithmic_family(d):
 
 def test_lemma_6_the_best_assignment_of_separated_robots_is_certified():
     world = SurveillanceConfig(n_agents=4, dtype="float64", **LOG)
-    g, slots, bounds = world.homing, torch.tensor(world.slot_positions, dtype=F64), torch.tensor(world.bounds, dtype=F64)
+    g, slots, bounds = (
+        world.homing,
+        torch.tensor(world.slot_positions, dtype=F64),
+        torch.tensor(world.bounds, dtype=F64),
+    )
     position = 2 * torch.rand(3000, 4, 2, generator=torch.Generator().manual_seed(0), dtype=F64) - 1
     apart = torch.stack([(position[:, i] - position[:, j]).norm(dim=-1) for i in range(4) for j in range(i)]).amin(0)
     position = position[apart > math.sqrt(2) * (g.clearance + g.eps_distance)]

@@ -168,6 +168,31 @@ def test_a_killed_sweep_of_controllers_goes_on(program, tmp_path):
     assert "nothing to do" in output
 
 
+def test_another_evaluation_in_the_same_folder_is_not_taken_for_this_one(program, tmp_path):
+    code, output = program(train.main, *TINY)
+    assert code == 0, output
+    (run,) = tmp_path.glob("runs/default/*_seed0")
+    common = (f"run={run}", "steps=4", "pictures=false", "resume=auto")
+    for num_envs in (2, 3):
+        code, output = program(evaluate.main, *common, f"num_envs={num_envs}")
+        assert code == 0, output
+        assert "nothing to do" not in output
+    assert "nothing to do" in program(evaluate.main, *common, "num_envs=3")[1]
+
+
+def test_overrides_of_an_evaluation_are_checked_in_the_runs_world(program, tmp_path):
+    """0.01 is below the default world's drain, but not below the run's."""
+    code, output = program(train.main, *TINY, "env.drain_rate=0.001", "env.charge_rate=0.02", "safety=paper")
+    assert code == 0, output
+    (run,) = tmp_path.glob("runs/default/*_seed0")
+    common = (f"run={run}", "steps=4", "num_envs=2", "pictures=false")
+    code, output = program(evaluate.main, *common, "env.charge_rate=0.01", "safety.alpha_s=2.0")
+    assert code == 0, output
+    code, output = program(evaluate.main, *common, "env.charge_rate=0.0005")
+    assert code == 1
+    assert "K_c > P(max_speed) fails" in output
+
+
 def test_run_folder_holds_the_certificate(program, tmp_path):
     code, output = program(train.main, *TINY)
     assert code == 0, output

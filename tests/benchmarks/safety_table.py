@@ -1,6 +1,8 @@
-"""Table of a safety study: ``python tests/benchmarks/safety_table.py <folder>`` reads every eval.json under the folder.
+"""Table of a safety study: ``python tests/benchmarks/safety_table.py <folder>`` reads every evaluation under the folder.
 
 One row per layout, number of robots, controller and filter (or summed over the controllers with ``--sum``), as Markdown.
+A certified evaluation stops at a violation and leaves violation.json instead of eval.json: such jobs and unfinished ones are
+named, and the program fails.
 """
 
 import json
@@ -19,6 +21,7 @@ COLUMNS = (
     "hold %",
     "homing %",
 )
+FILES = ("eval.json", "violation.json")
 MARGINS = ("E margin", "distance margin m", "way-points / 1000")
 
 
@@ -26,14 +29,18 @@ def layout(env: dict) -> str:
     """Name of a world of the study by what distinguishes it."""
     names = {0: "perimeter", 1: "ring", 8: "interior"}
     name = "aerial" if env["dimension"] == 3 else names.get(len(env["stations"]), f"{len(env['stations'])} stations")
-    extras = [env["reserve"]] * (env["reserve"] != "linear") + [env["dtype"]] * (env["dtype"] != "float32")
+    extras = [f"dt={env['dt']}"] * (env["dt"] != 0.2) + ["fixed slots"] * (not env["reassign_slots"])
+    extras += [env["reserve"]] * (env["reserve"] != "linear") + [env["dtype"]] * (env["dtype"] != "float32")
     return " ".join([name, *extras])
 
 
 def filter_name(safety: dict) -> str:
     """Name of a filter by its configuration group."""
-    if safety["mode"] != "paper":
-        return safety["mode"]
+    changes = [safety[name] for name in ("split", "solver") if safety[name] not in ("auto", "anchor", "exact")]
+    if safety["mode"] == "certified":
+        return " ".join(["certified", *changes])
+    if safety["mode"] == "none":
+        return "none"
     if safety["composition"] == "min":
         return "paper"
     return safety["split"] if safety["split"] == "joint" else "stacked" if safety["sampled_data"] else "half"
@@ -83,6 +90,13 @@ def main() -> None:
         )
         lines.append("| " + " | ".join(cells) + " |")
     sys.stdout.write("\n".join(lines) + f"\n\n{steps:,} robot-steps\n")
+    violated = sorted(folder.rglob("violation.json"))
+    unfinished = [p.parent for p in folder.rglob(".hydra") if not any((p.parent / f).is_file() for f in FILES)]
+    for path in violated:
+        sys.stdout.write(f"VIOLATION behind the certified filter: {path} {json.loads(path.read_text())['kinds']}\n")
+    for path in sorted(unfinished):
+        sys.stdout.write(f"unfinished: {path}\n")
+    sys.exit(1 if violated or unfinished else 0)
 
 
 if __name__ == "__main__":

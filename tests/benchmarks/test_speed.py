@@ -36,7 +36,8 @@ def test_step(n_agents, num_envs):
     filters = {
         "none": SafetyConfig(mode="none"),
         "paper": SafetyConfig(mode="paper", composition="min", split="full", sampled_data=False),
-        "stacked": SafetyConfig(),
+        "stacked": SafetyConfig(mode="paper"),
+        "certified": SafetyConfig(),
     }
     td = SafetyFilter(filters["none"], world)(make_controller("random", world)(env.reset()))
     print(f"\nN={n_agents} B={num_envs} threads={torch.get_num_threads()}")
@@ -66,6 +67,28 @@ def test_qp_exact_against_qpth(n_agents):
     )
 
 
+@pytest.mark.parametrize("controller", ["random", "patrol"])
+@pytest.mark.parametrize("n_agents", [3, 5, 8])
+@pytest.mark.parametrize("num_envs", [128, 512, 4096])
+def test_certified_filter_against_stacked(n_agents, num_envs, controller):
+    """On states that a roll-out behind the certified filter reaches."""
+    world = SurveillanceConfig(n_agents=n_agents)
+    filters = [SafetyFilter(safety, world) for safety in (SafetyConfig(), SafetyConfig(mode="paper"))]
+    env, nominal, states = SurveillanceEnv(world, num_envs, seed=1), make_controller(controller, world), []
+    with torch.no_grad():
+        td = env.reset()
+        for k in range(60):
+            td = filters[0](nominal(td))
+            if k % 10 == 9:
+                states.append(td.clone())
+            td = env.step(td)["next"]
+        certified, stacked = (median_ms(lambda f=f: [f(td.clone()) for td in states], 5) / 6 for f in filters)
+    print(
+        f"\nN={n_agents} B={num_envs} {controller}: certified {certified:.2f} ms, stacked {stacked:.2f} ms, "
+        f"ratio {certified / stacked:.2f}"
+    )
+
+
 def test_update():
     world, agent, safety = SurveillanceConfig(), AgentConfig(), SafetyConfig()
     env = SurveillanceEnv(world, 256)
@@ -86,9 +109,13 @@ def test_rollout_against_unfiltered():
     print()
     world = SurveillanceConfig()
     base = None
-    for name, safety in {"none": SafetyConfig(mode="none"), "stacked": SafetyConfig()}.items():
+    for name, safety in {
+        "none": SafetyConfig(mode="none"),
+        "stacked": SafetyConfig(mode="paper"),
+        "certified": SafetyConfig(),
+    }.items():
         env = SurveillanceEnv(world, 512)
         policy = TensorDictSequential(make_controller("lloyd", world), SafetyFilter(safety, world))
         spent = median_ms(lambda env=env, policy=policy: env.rollout(20, policy, break_when_any_done=False), 3) / 20
         base = base or spent
-        print(f"rollout behind {name:8s} {spent:.2f} ms/step  {spent / base:.2f} x unfiltered")
+        print(f"rollout behind {name:9s} {spent:.2f} ms/step  {spent / base:.2f} x unfiltered")
