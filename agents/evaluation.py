@@ -80,8 +80,8 @@ def evaluate_policy(
         else:
             alive = alive & ~ended
     metrics = {
-        "coverage_cost": float(total["cost"] / total["worlds"].clamp_min(1)),
-        "episode_reward": float(total["reward"] / env.batch_size.numel()),
+        "coverage_cost": _finite(total["cost"] / total["worlds"].clamp_min(1)),
+        "episode_reward": _finite(total["reward"] / env.batch_size.numel()),
         "violations": {kind: int(count) for kind, count in violations.items()},
         "charges_per_robot": float(charges.count.to(torch.float64).mean()),
         "min_energy_margin": _finite(energy_margin),
@@ -101,7 +101,7 @@ def evaluation_scalars(metrics: dict) -> dict[str, float]:
 
 
 def _finite(value: Tensor) -> float | None:
-    """None (JSON null) where there is nothing to measure, such as the distance of a single robot."""
+    """None (JSON null) where there is nothing to measure: one robot's distance, the cost of an unfiltered NaN action."""
     return float(value) if math.isfinite(value) else None
 
 

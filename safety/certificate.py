@@ -87,8 +87,8 @@ def anchors(
     """Joint action that satisfies all rows on C, and what it leaves of the pairs' slack.
 
     A robot whose survivability row excludes standing still is critical: it drives home, at least as fast as the row
-    demands. The others stand. While a pair's slack is negative, both of its robots drive home; two robots that both
-    do so keep their slack by the certificate.
+    demands. The others stand. While a pair's slack is negative, both of its robots drive home; what two homing robots
+    still lack (in the last partial step, or one driving faster than ``v``) the rows leave to the shield.
 
     Args:
         chord_normal: ``(M, N, d)``, survivability row's normal.
