@@ -9,6 +9,7 @@ from torch import Tensor
 
 from envs import SurveillanceConfig, keys
 from envs.density import Density
+from envs.homing import homing_velocity, reserve
 
 
 class Controller(TensorDictModuleBase):
@@ -68,6 +69,21 @@ class Controller(TensorDictModuleBase):
         position = tensordict[keys.POSITION]
         _, slots, _ = self.tools(position)
         return position, slots.to(position.dtype)[tensordict[keys.SLOT].squeeze(-1)]
+
+    def way_to_charge(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Who drives home to charge or stays to be charged, ``(*B, N)`` bool, and the way home, ``(*B, N, d)`` m/s.
+
+        A robot goes when its energy nears the reserve, and stays until nearly full. The hysteresis needs no memory: a
+        robot inside its slot's charging radius that is not full stays.
+        """
+        world, geometry = self.world, self.geometry
+        position, slot_position = self.places(tensordict)
+        energy = tensordict[keys.ENERGY].squeeze(-1)
+        way = (position - slot_position).norm(dim=-1)
+        span = world.energy_max - world.energy_min
+        low = energy - world.energy_min - reserve(way, geometry) <= 0.15 * span
+        charging = (way <= geometry.charge_radius) & (energy < world.energy_max - 0.1 * span)
+        return low | charging, homing_velocity(position, slot_position, geometry)
 
     def memory(self, like: Tensor, start: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
         """The memory that belongs to positions such as ``like``, made by ``start`` where there is none; to be written to."""

@@ -13,7 +13,6 @@ from agents.patrol import Patrol
 from envs import SurveillanceConfig, keys
 from envs.coverage import coverage_cost, coverage_gradient, voronoi_moments
 from envs.dynamics import limit_speed
-from envs.homing import homing_velocity, reserve
 from safety import SafetyConfig, SafetyFilter
 
 
@@ -36,16 +35,8 @@ class ChargeWhenLow(Lloyd):
 
     def act(self, tensordict: TensorDictBase) -> Tensor:
         """See the class."""
-        world, geometry = self.world, self.geometry
-        position, energy = tensordict[keys.POSITION], tensordict[keys.ENERGY].squeeze(-1)
-        _, slots, _ = self.tools(position)
-        slot_position = slots[tensordict[keys.SLOT].squeeze(-1)]
-        distance = (position - slot_position).norm(dim=-1)
-        span = world.energy_max - world.energy_min
-        low = energy - world.energy_min - reserve(distance, geometry) <= 0.15 * span
-        charging = (distance <= geometry.charge_radius) & (energy < world.energy_max - 0.1 * span)
-        home = homing_velocity(position, slot_position, geometry)
-        return torch.where((low | charging).unsqueeze(-1), home, super().act(tensordict))
+        home, way_home = self.way_to_charge(tensordict)
+        return torch.where(home.unsqueeze(-1), way_home, super().act(tensordict))
 
 
 class CoverageCBF(Controller):

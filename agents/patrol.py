@@ -6,7 +6,6 @@ from torch import Tensor
 
 from agents.base import Controller
 from envs import SurveillanceConfig, keys
-from envs.homing import homing_velocity, reserve
 
 
 class Patrol(Controller):
@@ -29,22 +28,16 @@ class Patrol(Controller):
 
     def act(self, tensordict: TensorDictBase) -> Tensor:
         """See the class."""
-        world, geometry = self.world, self.geometry
-        position, slot_position = self.places(tensordict)
-        energy = tensordict[keys.ENERGY].squeeze(-1)
+        position = tensordict[keys.POSITION]
         memory = self.memory(position, lambda: self._start(position))
-        way = (position - slot_position).norm(dim=-1)
-        span = world.energy_max - world.energy_min
-        low = energy - world.energy_min - reserve(way, geometry) <= 0.15 * span
-        charging = (way <= geometry.charge_radius) & (energy < world.energy_max - 0.1 * span)
-        home = low | charging
+        home, way_home = self.way_to_charge(tensordict)
         reached = (memory["waypoint"] - position).norm(dim=-1) <= self.arrival
         memory["reached"] = memory["reached"] + (reached & ~home)
         fresh = self.points(position, *position.shape[:-1])
         memory["waypoint"] = torch.where((reached | home).unsqueeze(-1), fresh, memory["waypoint"])
         offset = memory["waypoint"] - position
-        out = offset * (world.max_speed / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30))
-        return torch.where(home.unsqueeze(-1), homing_velocity(position, slot_position, geometry), out)
+        out = offset * (self.world.max_speed / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30))
+        return torch.where(home.unsqueeze(-1), way_home, out)
 
     def metrics(self) -> dict[str, float]:
         """``waypoints``: number reached so far, over all robots and worlds."""

@@ -254,13 +254,7 @@ def is_certified(
 ) -> Tensor:
     """Whether a joint state is in the certified set, with the margins demanded on entry (two rounding margins).
 
-    Args:
-        position: ``(*B, N, d)``, m.
-        energy: ``(*B, N)``.
-        slot_position: ``(*B, N, d)``, m.
-        geometry: constants of the backup motion.
-        bounds: ``(d, 2)``, the arena, m.
-        clearance: distance demanded on top of ``geometry.clearance``, m.
+    Args and shapes as :func:`certified_robots`; ``clearance`` (m) is demanded on top of ``geometry.clearance``.
 
     Returns:
         ``(*B,)`` bool.

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from envs.dynamics import dot, limit_speed, pair_indices
 from envs.homing import (
+    TINY,
     ClosestMoments,
     HomingGeometry,
     certified_pairs,
@@ -30,7 +31,6 @@ from envs.homing import (
     homing_velocity,
 )
 
-TINY = 1e-30  # below it a length is 0
 HOLD, HOMING = 1, 2  # levels above 0, the quadratic program
 
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from envs.dynamics import dot, other_indices, pair_indices
-from envs.homing import ClosestMoments, HomingGeometry, closest_moments
-from safety.certificate import TINY, anchors, from_slot, pair_gradients
+from envs.homing import TINY, ClosestMoments, HomingGeometry, closest_moments
+from safety.certificate import anchors, from_slot, pair_gradients
 from safety.config import Gains
 
 
