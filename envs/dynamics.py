@@ -1,5 +1,7 @@
 """Motion of the robots: single integrator, exact under a zero-order hold, with a Euclidean speed limit."""
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -43,6 +45,17 @@ def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Ten
     """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j
+
+
+@functools.lru_cache(maxsize=64)
+def own_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Robot i's pairs, others in cyclic order, and its side in them (0 in pair (i, j), 1 in (j, i)): ``(N, N - 1)`` each."""
+    i, j = pair_indices(n_agents, device)
+    others = other_indices(n_agents, device)
+    robots = torch.arange(n_agents, device=device).unsqueeze(-1)
+    number = torch.zeros(n_agents, n_agents, dtype=torch.int64, device=device)
+    number[i, j] = number[j, i] = torch.arange(len(i), device=device)
+    return number[robots, others], (robots > others).to(torch.int64)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

@@ -96,13 +96,24 @@ def homing_velocity(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     return offset * torch.clamp(geometry.speed / distance.clamp_min(TINY), max=1 / geometry.dt)
 
 
-class ClosestMoments(NamedTuple):
+class ClosestPieces(NamedTuple):
     """Where two homing robots come closest on each of the S straight pieces of their relative path."""
 
     distance: Tensor
     """Distance then, ``(S, *B, P)``, m; its least is ``G``."""
     relative: Tensor
     """Relative position ``xi_i - xi_j`` then, ``(S, d, *B, P)``, m."""
+    time: Tensor
+    """When, ``(S, *B, P)``: in steps (linear family), or the share of the way done (logarithmic)."""
+
+
+class ClosestMoments(NamedTuple):
+    """:class:`ClosestPieces` with what the distance's gradient needs of robots i and j."""
+
+    distance: Tensor
+    """``(S, *B, P)``, m."""
+    relative: Tensor
+    """``(S, d, *B, P)``, m."""
     share: Tensor
     """``l / D``: share of the way home still to go for i and j, ``(S, 2, *B, P)``."""
     slope: Tensor
@@ -124,31 +135,53 @@ def closest_approach(position: Tensor, slot_position: Tensor, geometry: HomingGe
     Returns:
         ``(*B, P)``, m, pairs in ``torch.triu_indices`` order.
     """
+    return closest_pieces(position, slot_position, geometry).distance.amin(dim=0)
+
+
+def closest_pieces(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestPieces:
+    """The closest approach on each straight piece; arguments as :func:`closest_approach`."""
     if geometry.family == "logarithmic":
-        start, end = _relative_ends(position, slot_position)
-        return segment_distance(start, end)
-    *_, relative = _relative_path(position, slot_position, geometry)
-    _, squared = _nearest_on_segments(relative)
-    return squared.amin(dim=0).sqrt()
+        corners = torch.stack(_relative_ends(position, slot_position)).movedim(-1, 1)
+        times = torch.arange(2, dtype=position.dtype, device=position.device).view(2, *[1] * (corners.dim() - 2))
+    else:
+        times, corners = _relative_path(position, slot_position, geometry)
+    start, first = corners[:-1], times[:-1]
+    along = corners[1:] - start
+    t = (-(start * along).sum(1) / along.square().sum(1).clamp_min(TINY)).clamp(0, 1)
+    relative = torch.addcmul(start, t.unsqueeze(1), along)
+    return ClosestPieces(relative.square().sum(1).sqrt(), relative, torch.addcmul(first, t, times[1:] - first))
+
+
+def way_to_go(distance: Tensor, time: Tensor, geometry: HomingGeometry) -> tuple[Tensor, Tensor]:
+    """Share of the way home that is left at ``time``, and its slope ``dl / dD``.
+
+    Args:
+        distance: ``(...)``, distance to the own slot at the start, m.
+        time: ``(...)``, as in :class:`ClosestPieces`.
+        geometry: constants of the backup motion.
+
+    Returns:
+        ``l / D`` and ``dl / dD``, both ``(...)``.
+    """
+    if geometry.family == "logarithmic":
+        share = torch.ones_like(distance) - time
+        return share, share
+    whole = (distance / (geometry.speed * geometry.dt)).floor()
+    slope = torch.where(time <= whole, 1.0, (whole + 1 - time).clamp_min(0))
+    to_go = _to_go(distance, whole, time, geometry)
+    # in the slot the last step's ratio stands
+    return torch.where(distance > 0, to_go / distance.clamp_min(TINY), slope), slope
 
 
 def closest_moments(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestMoments:
-    """The moments of closest approach on each straight piece; arguments as :func:`closest_approach`."""
-    if geometry.family == "logarithmic":
-        corners = torch.stack(_relative_ends(position, slot_position)).movedim(-1, 1)
-        t, squared = _nearest_on_segments(corners)
-        relative = corners[:1] + t.unsqueeze(1) * (corners[1:] - corners[:1])
-        share = (1 - t).unsqueeze(1).expand(-1, 2, *t.shape[1:])
-        return ClosestMoments(squared.sqrt(), relative, share, share)
-    distance, whole, times, corners = _relative_path(position, slot_position, geometry)
-    t, squared = _nearest_on_segments(corners)
-    time = (times[:-1] + t * (times[1:] - times[:-1])).unsqueeze(1)
-    to_go = _to_go(distance, whole, time, geometry)
-    slope = torch.where(time <= whole, 1.0, (whole + 1 - time).clamp_min(0))
-    # in the slot the last step's ratio stands
-    share = torch.where(distance > 0, to_go / distance.clamp_min(TINY), slope)
-    relative = corners[:-1] + t.unsqueeze(1) * (corners[1:] - corners[:-1])
-    return ClosestMoments(squared.sqrt(), relative, share, slope)
+    """:func:`closest_pieces` with both robots' way to go; arguments as :func:`closest_approach`."""
+    pieces = closest_pieces(position, slot_position, geometry)
+    offset = position - slot_position
+    distance = torch.stack(
+        [dot(offset, offset).sqrt()[..., x] for x in pair_indices(position.shape[-2], position.device)]
+    )
+    share, slope = way_to_go(distance, pieces.time.unsqueeze(1), geometry)
+    return ClosestMoments(pieces.distance, pieces.relative, share, slope)
 
 
 def _relative_ends(position: Tensor, slot_position: Tensor) -> tuple[Tensor, Tensor]:
@@ -163,21 +196,23 @@ def _relative_path(
     """Corners of the relative homing path of every pair (linear family).
 
     Returns:
-        Distance to the slot ``D (2, *B, P)`` and whole steps ``n (2, *B, P)`` of i and j, times ``(5, *B, P)`` in
-        steps, relative positions ``(5, d, *B, P)``: leading dimensions first, as sums over long runs are fast.
+        Times ``(5, *B, P)`` in steps and relative positions ``(5, d, *B, P)``: leading dimensions first, as sums over
+        long runs are fast.
     """
-    pair = torch.stack(pair_indices(position.shape[-2], position.device))  # (2, P)
-    offset = (position - slot_position).movedim(-1, 0)
-    distance = offset.square().sum(0).sqrt()
-    direction = (offset / distance.clamp_min(TINY))[..., pair].movedim(-2, 1)  # (d, 2, *B, P)
-    slot = slot_position.movedim(-1, 0)[..., pair].movedim(-2, 1)
-    distance = distance[..., pair].movedim(-2, 0)  # (2, *B, P)
+    i, j = pair_indices(position.shape[-2], position.device)
+    offset = position - slot_position
+    distance = dot(offset, offset).sqrt()
+    direction = (offset / distance.clamp_min(TINY).unsqueeze(-1)).movedim(-1, 0)  # (d, *B, N)
     whole = (distance / (geometry.speed * geometry.dt)).floor()
-    first, last = whole.amin(dim=0), whole.amax(dim=0)
+    n_i, n_j = whole[..., i], whole[..., j]
+    first, last = torch.minimum(n_i, n_j), torch.maximum(n_i, n_j)
     times = torch.stack([torch.zeros_like(first), first, first + 1, torch.maximum(last, first + 1), last + 1])
-    to_go = _to_go(distance, whole, times.unsqueeze(1), geometry)  # (5, 2, *B, P)
-    path = slot + direction * to_go.unsqueeze(1)  # (5, d, 2, *B, P)
-    return distance, whole, times, path[:, :, 0] - path[:, :, 1]
+    slots = slot_position.movedim(-1, 0)
+    corners = slots[..., i] - slots[..., j]
+    corners = torch.addcmul(corners, direction[..., i], _to_go(distance[..., i], n_i, times, geometry).unsqueeze(1))
+    return times, torch.addcmul(
+        corners, direction[..., j], _to_go(distance[..., j], n_j, times, geometry).unsqueeze(1), value=-1
+    )
 
 
 def _to_go(distance: Tensor, whole: Tensor, times: Tensor, geometry: HomingGeometry) -> Tensor:
@@ -185,21 +220,6 @@ def _to_go(distance: Tensor, whole: Tensor, times: Tensor, geometry: HomingGeome
     step = geometry.speed * geometry.dt
     last_step = (distance - whole * step) * (whole + 1 - times)
     return torch.where(times <= whole, distance - times * step, last_step).clamp_min(0)
-
-
-def _nearest_on_segments(corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Nearest points to 0 of the segments between successive corners ``(K, d, ...)``: place in [0, 1] and square."""
-    start = corners[:-1]
-    along = corners[1:] - start
-    t = (-(start * along).sum(1) / along.square().sum(1).clamp_min(TINY)).clamp(0, 1)
-    return t, (start + t.unsqueeze(1) * along).square().sum(1)
-
-
-def segment_distance(start: Tensor, end: Tensor) -> Tensor:
-    """Distance of the origin to the segment from ``start`` to ``end``, ``(..., d), (..., d) -> (...)``."""
-    along = end - start
-    t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(TINY)).clamp(0, 1)
-    return (start + t.unsqueeze(-1) * along).norm(dim=-1)
 
 
 def certified_robots(

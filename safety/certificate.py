@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, limit_speed, pair_indices
+from envs.dynamics import dot, limit_speed, own_pairs, pair_indices
 from envs.homing import (
     TINY,
     ClosestMoments,
@@ -119,7 +119,7 @@ def anchors(
         tight = (slack < 0).any(dim=1) & ~(moving[:, i] & moving[:, j])
         if not tight.any():
             break
-        moving = moving | _either(tight, n, i, j)
+        moving = moving | _either(tight, n)
     return chosen, slack
 
 
@@ -129,8 +129,7 @@ def outside(
     """Robots whose own part of the certified set, or a pair's that they belong to, does not hold: ``(M, N)`` bool."""
     robots = certified_robots(position, energy, slot_position, geometry, bounds, margins=0)
     pairs = certified_pairs(closest, geometry, margins=0)
-    n = position.shape[1]
-    return ~robots | _either(~pairs, n, *pair_indices(n, position.device))
+    return ~robots | _either(~pairs, position.shape[1])
 
 
 def shield(
@@ -208,10 +207,9 @@ def shield(
 
 def pair_minimum(pairs: Tensor, n: int) -> Tensor:
     """Least value of the pairs that a robot belongs to: ``(M, P)`` to ``(M, N)``, +inf for a single robot."""
-    i, j = pair_indices(n, pairs.device)
-    square = pairs.new_full((len(pairs), n, n), torch.inf)
-    square[:, i, j] = square[:, j, i] = pairs
-    return square.amin(dim=-1)
+    if n == 1:
+        return pairs.new_full((len(pairs), 1), torch.inf)
+    return pairs[:, own_pairs(n, pairs.device)[0]].amin(dim=-1)
 
 
 def _by_level(action: Tensor, home: Tensor, level: Tensor) -> Tensor:
@@ -225,9 +223,6 @@ def _pair_use(normals: Tensor, action: Tensor, i: Tensor, j: Tensor) -> Tensor:
     return (normals * both).sum((2, 4))
 
 
-def _either(pairs: Tensor, n: int, *members: Tensor) -> Tensor:
-    """Robots that are a ``member`` of a marked pair: ``(M, P)`` bool to ``(M, N)`` bool."""
-    marked = torch.zeros(len(pairs), n, dtype=torch.int64, device=pairs.device)
-    for member in members:
-        marked = marked.index_add(1, member, pairs.to(torch.int64))
-    return marked > 0
+def _either(pairs: Tensor, n: int) -> Tensor:
+    """Robots that belong to a marked pair: ``(M, P)`` bool to ``(M, N)`` bool."""
+    return pairs[:, own_pairs(n, pairs.device)[0]].any(dim=-1)

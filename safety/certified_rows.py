@@ -1,24 +1,28 @@
 """Rows of every robot's quadratic program on the certified set, centred on the anchor of :mod:`safety.certificate`."""
 
-import functools
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, other_indices, pair_indices
-from envs.homing import TINY, ClosestMoments, HomingGeometry, closest_moments
+from envs.dynamics import dot, own_pairs, pair_indices
+from envs.homing import TINY, ClosestPieces, HomingGeometry, closest_moments, closest_pieces, way_to_go
 from safety.certificate import anchors, from_slot, pair_gradients
 from safety.config import Gains
 
+HAIR = 1e-5
+"""Relative margin of the test whether a target may violate a row; the solver looks again, in float64."""
+
 
 class Rows(NamedTuple):
-    """Constraints ``G u <= h`` of every robot's own program, and the action they are centred on."""
+    """Constraints ``G u <= h`` of K robots' own programs, and the joint action that they are centred on."""
 
+    robots: Tensor
+    """Which robots, as places in ``(M N,)``, ``(K,)`` int64: those whose target may violate a row."""
     G: Tensor
-    """``(M, N, m, d)``."""
+    """``(K, m, d)``."""
     h: Tensor
-    """``(M, N, m)``, +inf for no constraint."""
+    """``(K, m)``, +inf for no constraint."""
     anchor: Tensor
     """Admissible joint action ``(M, N, d)``, m/s."""
     closest: Tensor
@@ -39,8 +43,9 @@ def certified_rows(
     safety_distance: float,
     max_speed: float,
     anchored: bool = True,
+    target: Tensor | None = None,
 ) -> Rows:
-    """Rows of every robot's program: survivability, collision and certificate shared around the anchor, arena.
+    """Rows of the robots' programs: survivability, collision and certificate shared around the anchor, arena.
 
     Collision (exact over the whole step, as ``h_s`` is convex along it): ``h_s + dt 2 q . (u_i - u_j) >= (1 - g_s) h_s``.
     Certificate: one linearised row for the closest approach on each straight piece of the relative way home, as another
@@ -58,32 +63,50 @@ def certified_rows(
         safety_distance: ``Delta``, m.
         max_speed: m/s.
         anchored: False centres the rows on standing still, the literature's split by halves (may be infeasible).
+        target: ``(M, N, d)`` in the speed ball, m/s: robots whose target satisfies all their rows get none. All, if None.
 
     Returns:
         ``m <= 1 + (N - 1) (1 + S) + 2 d`` rows per robot, S = 4 pieces (linear family) or 1 (logarithmic): pairs' rows
         that hold for every action in the speed ball are left out.
     """
-    d = position.shape[-1]
-    device, step = position.device, max_speed * geometry.dt
-    moments = _with_present(closest_moments(position, slot_position, geometry), position)
-    now, later = moments.distance[0], moments.distance[1:]
+    n, d = position.shape[1:]
+    step, device = max_speed * geometry.dt, position.device
+    pieces = closest_pieces(position, slot_position, geometry)
+    i, j = pair_indices(n, device)
+    gap = position[:, i] - position[:, j]
+    now, later = dot(gap, gap).sqrt(), pieces.distance
     spare = (later - geometry.clearance - geometry.eps_distance).clamp_min(0)
     # a class-K function that is flat at 0: what the linearisation of G misses near the limit is of second order too
     decrease = gains.certificate * spare.square() / (spare + step)
     collision = gains.collision * (now.square() - safety_distance**2) / (2 * now).clamp_min(TINY)
-    slack = torch.cat([collision.unsqueeze(0), decrease]).movedim(0, 1)  # (M, K, P), m/s
+    slack = torch.cat([collision.unsqueeze(0), decrease])  # (K, M, P), m/s: row 0 is the present distance's
+    # the collision row is the row of a piece on which nobody has moved yet
+    present = (now, gap.movedim(-1, 0), torch.zeros_like(now))
+    pieces = ClosestPieces(*(torch.cat([x.unsqueeze(0), y]) for x, y in zip(present, pieces, strict=True)))
     anchor = torch.zeros_like(position)
     critical = (chord_bound < 0).any(dim=-1).nonzero().squeeze(-1)
     if anchored and len(critical):  # elsewhere all may stand: their slack is not negative
-        some = ClosestMoments(*(x.movedim(-2, 0)[critical].movedim(0, -2) for x in moments))
         states = (chord_normal[critical], chord_bound[critical], position[critical], slot_position[critical])
-        normals = -pair_gradients(some, *states[2:]).permute(3, 0, 1, 4, 2)  # (M, K, 2, P, d)
-        anchor[critical], slack[critical] = anchors(*states, normals, slack[critical], geometry, max_speed)
-    normals, shares = _own_rows(moments, slack, anchor, position, slot_position, max_speed)
-    walls = torch.eye(d, dtype=position.dtype, device=device)
+        along = -pair_gradients(closest_moments(*states[2:], geometry), *states[2:])
+        first = -gap[critical].movedim(-1, 0) / now[critical].clamp_min(TINY)
+        normals = torch.cat([torch.stack([first, -first]).unsqueeze(0), along]).permute(3, 0, 1, 4, 2)
+        anchor[critical], left = anchors(*states, normals, slack[:, critical].movedim(1, 0), geometry, max_speed)
+        slack[:, critical] = left.movedim(0, 1)
     room = torch.cat([bounds[:, 1] - position, position - bounds[:, 0]], dim=-1).clamp_min(0) / geometry.dt
+    if target is None:
+        robots = torch.arange(position.shape[0] * n, device=device)
+    else:
+        robots = (
+            _pressed(target, anchor, chord_normal, chord_bound, slack, room, max_speed).flatten().nonzero().squeeze(-1)
+        )
+    arguments = (position, slot_position, anchor, chord_normal, chord_bound, room)
+    *own, chord_normal, chord_bound, room = (x.flatten(0, 1)[robots] for x in arguments)
+    normals, shares = _own_rows(pieces, slack, n, robots, *own, geometry, max_speed)
+    walls = torch.eye(d, dtype=position.dtype, device=device)
+    walls = torch.cat([walls, -walls]).expand(len(robots), 2 * d, d)
     return Rows(
-        G=torch.cat([chord_normal.unsqueeze(2), normals, torch.cat([walls, -walls]).expand(*room.shape, d)], dim=2),
+        robots=robots,
+        G=torch.cat([chord_normal.unsqueeze(1), normals, walls], dim=1),
         h=torch.cat([chord_bound.unsqueeze(-1), shares, room], dim=-1),
         anchor=anchor,
         closest=later.amin(dim=0),
@@ -91,67 +114,67 @@ def certified_rows(
     )
 
 
-def _with_present(moments: ClosestMoments, position: Tensor) -> ClosestMoments:
-    """Prepend the present moment: the collision row is the row of a piece on which nobody has moved yet."""
-    i, j = pair_indices(position.shape[-2], position.device)
-    gap = (position[..., i, :] - position[..., j, :]).movedim(-1, 0).unsqueeze(0)
-    ones = torch.ones_like(moments.share[:1])
-    return ClosestMoments(
-        torch.cat([gap.square().sum(1).sqrt(), moments.distance]),
-        torch.cat([gap, moments.relative]),
-        torch.cat([ones, moments.share]),
-        torch.cat([ones, moments.slope]),
-    )
+def _pressed(
+    target: Tensor,
+    anchor: Tensor,
+    chord_normal: Tensor,
+    chord_bound: Tensor,
+    slack: Tensor,
+    room: Tensor,
+    max_speed: float,
+) -> Tensor:
+    """Robots that may violate a row at their target, ``(M, N)`` bool: none that does is missing, NaN is among them."""
+    n = target.shape[1]
+    away = target - anchor
+    fine = dot(chord_normal, target) + HAIR * dot(chord_normal, chord_normal).sqrt() * max_speed <= chord_bound
+    fine = fine & (torch.cat([target, -target], dim=-1) + HAIR * max_speed <= room).all(dim=-1)
+    if n > 1:
+        least = slack.amin(dim=0)[:, own_pairs(n, target.device)[0]].amin(dim=-1)
+        # the normals are no longer than 1
+        fine = fine & (2 * (1 + HAIR) * dot(away, away).sqrt() <= least)
+    return ~fine
 
 
 def _own_rows(
-    moments: ClosestMoments, slack: Tensor, anchor: Tensor, position: Tensor, slot_position: Tensor, max_speed: float
+    pieces: ClosestPieces,
+    slack: Tensor,
+    n: int,
+    robots: Tensor,
+    position: Tensor,
+    slot_position: Tensor,
+    anchor: Tensor,
+    geometry: HomingGeometry,
+    max_speed: float,
 ) -> tuple[Tensor, Tensor]:
-    """Every robot's half of the rows of its pairs, without those that no action in the speed ball can reach.
+    """The K robots' halves of the rows of their pairs, without those that no action in the speed ball can reach.
 
     Args:
-        moments: K pieces of the M worlds' pairs.
-        slack: ``(M, K, P)``, m/s, what the anchor leaves.
-        anchor: ``(M, N, d)``, m/s.
-        position: ``(M, N, d)``, m.
-        slot_position: ``(M, N, d)``, m.
+        pieces: the present moment and the S pieces of the M worlds' pairs.
+        slack: ``(1 + S, M, P)``, m/s, what the anchor leaves.
+        n: number of robots in a world.
+        robots: ``(K,)``, places in ``(M N,)``.
+        position: ``(K, d)``, m.
+        slot_position: ``(K, d)``, m.
+        anchor: ``(K, d)``, m/s.
+        geometry: constants of the backup motion.
         max_speed: m/s.
 
     Returns:
-        Normals ``(M, N, R, d)`` and bounds ``(M, N, R)``, m/s; R is the largest number of rows that a robot needs.
+        Normals ``(K, R, d)`` and bounds ``(K, R)``, m/s; R is the largest number of rows that a robot needs.
     """
-    m, n, d = position.shape
-    pair, side = _own_pairs(n, position.device)  # (N, N - 1)
-    half = (slack.clamp_min(0) / 2)[:, :, pair].permute(0, 2, 1, 3).flatten(-2)  # (M, N, K (N - 1))
+    world, others = (robots // n).unsqueeze(-1), max(n - 1, 1)
+    pair, side = (x[robots % n] for x in own_pairs(n, robots.device))  # (K, N - 1)
+    half = slack[:, world, pair].clamp_min(0).movedim(0, 1).flatten(1) / 2  # (K, (1 + S) (N - 1))
     # the normals are no longer than 1, so such a row holds for every action
     idle = half >= max_speed + dot(anchor, anchor).sqrt().unsqueeze(-1)
     count = int((~idle).sum(-1).max()) if half.numel() else 0
     half, entry = half.topk(count, dim=-1, largest=False)
-    robots = torch.arange(n, device=position.device).unsqueeze(-1)
-    piece, other = entry // max(n - 1, 1), entry % max(n - 1, 1)
-    own, second = pair[robots, other], side[robots, other]  # (M, N, R)
-    world = torch.arange(m, device=position.device)[:, None, None]
-
-    def pick(values: Tensor, *index: Tensor) -> Tensor:
-        return values[(*index, world, own)]
-
-    distance = pick(moments.distance, piece).clamp_min(TINY).unsqueeze(-1)
-    normal = (
-        torch.stack([pick(moments.relative, piece, torch.full_like(piece, x)) for x in range(d)], dim=-1) / distance
-    )
-    share, slope = pick(moments.share, piece, second).unsqueeze(-1), pick(moments.slope, piece, second).unsqueeze(-1)
-    e = from_slot(position, slot_position).unsqueeze(2)
-    gradient = share * normal + (slope - share) * dot(e, normal).unsqueeze(-1) * e
+    piece, other = entry // others, entry % others
+    own, second = pair.gather(1, other), side.gather(1, other)  # (K, R)
+    relative, distance = pieces.relative[piece, :, world, own], pieces.distance[piece, world, own]
+    offset = position - slot_position
+    share, slope = way_to_go(dot(offset, offset).sqrt().unsqueeze(-1), pieces.time[piece, world, own], geometry)
+    e, normal = from_slot(position, slot_position).unsqueeze(1), relative / distance.clamp_min(TINY).unsqueeze(-1)
+    gradient = share.unsqueeze(-1) * normal + ((slope - share) * dot(e, normal)).unsqueeze(-1) * e
     normals = torch.where((second == 0).unsqueeze(-1), -gradient, gradient)
-    return normals, half + dot(normals, anchor.unsqueeze(2))
-
-
-@functools.lru_cache(maxsize=64)
-def _own_pairs(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Robot i's pairs and its side in them (0 in pair (i, j), 1 in pair (j, i)): ``(N, N - 1)`` each."""
-    i, j = pair_indices(n, device)
-    others = other_indices(n, device)
-    robots = torch.arange(n, device=device).unsqueeze(-1)
-    number = torch.zeros(n, n, dtype=torch.int64, device=device)
-    number[i, j] = number[j, i] = torch.arange(len(i), device=device)
-    return number[robots, others], (robots > others).to(torch.int64)
+    return normals, half + dot(normals, anchor.unsqueeze(1))

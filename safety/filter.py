@@ -37,7 +37,7 @@ from safety.barriers import (
     sampled_energy_row,
 )
 from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
-from safety.certified_rows import certified_rows
+from safety.certified_rows import Rows, certified_rows
 from safety.config import SafetyConfig
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
 from safety.speed_faces import speed_faces
@@ -171,8 +171,9 @@ class SafetyFilter(TensorDictModuleBase):
             safety_distance=world.safety_distance,
             max_speed=world.max_speed,
             anchored=self.safety.split != "half",
+            target=target.detach(),
         )
-        action, status, residual = self._solve_per_robot(target, rows.G, rows.h)
+        action, status, residual = self._solve_pressed(target, rows)
         action = limit_speed(action, world.max_speed)  # as the environment will: the shield trusts no solver
         status = torch.where(finite, status, int(QPStatus.INACCURATE))
         beyond = outside(position, energy, home, rows.closest, geometry, bounds)
@@ -239,8 +240,19 @@ class SafetyFilter(TensorDictModuleBase):
         status = torch.where(impossible, int(QPStatus.INFEASIBLE), status)
         return action, current, status, residual
 
+    def _solve_pressed(self, target: Tensor, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
+        """Programs of the robots that have rows; the others keep their target ``(M, N, d)`` bit for bit."""
+        m, n, d = target.shape
+        status, residual = torch.zeros(m * n, dtype=torch.int64, device=target.device), target.new_zeros(m * n)
+        action = target.reshape(-1, d)
+        if len(rows.robots):
+            solution = self._solve_per_robot(action[rows.robots], rows.G, rows.h)
+            action = action.index_copy(0, rows.robots, solution[0])
+            status[rows.robots], residual[rows.robots] = solution[1], solution[2]
+        return action.view(m, n, d), status.view(m, n), residual.view(m, n)
+
     def _solve_per_robot(self, target: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One problem per robot: ``G (*B, N, m, d)``, ``h (*B, N, m)``."""
+        """One problem per robot: ``target (*B, d)``, ``G (*B, m, d)``, ``h (*B, m)``."""
         radius = self.world.max_speed
         if self.safety.solver == "qpth":
             faces, offset = speed_faces(target.shape[-1], radius)

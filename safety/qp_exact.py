@@ -23,6 +23,7 @@ from torch import Tensor
 
 from envs.dynamics import dot
 from safety.kkt import SCALE_FLOOR, TINY, QPStatus, Raw, column_norm, kkt_residual, norm, normalise_rows, pivoted_basis
+from safety.projection import Nearest, nearest_on_lines
 
 EARLY_STOP = 1e-12
 """KKT violation (relative) at which no larger active set is tried: a few thousand roundings of float64."""
@@ -33,6 +34,8 @@ GRAZE = 1e-8
 multipliers; opening the chord by 1e-8 radii changes ‖u‖ by 5e-17 relative and makes them exist."""
 CHUNK_BYTES = 256 * 2**20
 """Bound on the temporaries of one enumeration step, bytes."""
+FAST_TOL = 1e-11
+"""KKT residual (relative) up to which the solution of the short way stands; above it the sample is enumerated."""
 ROOT_ITERATIONS = 80
 """Most steps of the search for the ball multiplier; 4 to 8 are usual."""
 
@@ -208,18 +211,46 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
     raw, m = Raw.blank(t, G.shape[1]), G.shape[1]
     outside = (dot(G, t[:, None]) > h).any(-1)
     if radius is not None:
-        outside = outside | (norm(t) > radius)
+        outside = outside | (dot(t, t).sqrt() > radius)
     index = outside.nonzero()[:, 0]
     if len(index):
         t, (G, h, size, impossible) = t[index], normalise_rows(G[index], h[index])
-        found = _enumerate_reachable(t, G, h, radius)
-        mu = found.c - 1
-        residual = kkt_residual(None, -t, G, h, found.u, found.lam, mu, radius)
-        residual = torch.where(impossible, torch.inf, residual)
-        part = Raw(found.u, (found.lam / size)[:, :m], mu, found.sizes, residual, found.sizes)
-        violation = torch.where(impossible, torch.inf, found.violation)
-        raw.put(index, settle(part, violation, found.nearest, radius, tol))
+        u, lam, c = _project(t, G, h, radius)
+        mu = c - 1
+        residual = kkt_residual(None, -t, G, h, u, lam, mu, radius)
+        part = Raw(u, lam, mu, torch.zeros_like(index), residual, torch.ones_like(index))
+        hard = (impossible | (residual > FAST_TOL)).nonzero()[:, 0]
+        if len(hard):
+            part.put(hard, _enumerate(t[hard], G[hard], h[hard], impossible[hard], radius, tol))
+        raw.put(index, part._replace(lam=(part.lam / size)[:, :m]))
     return raw
+
+
+def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Nearest:
+    """:func:`nearest_on_lines`, in chunks and without the rows that lie beyond the ball everywhere: they cannot bind."""
+    (B, width, n), all_rows = G.shape, None
+    m = width
+    if radius is not None:
+        most = max(1, int((h < radius).sum(-1).max()))
+        if most < m:
+            all_rows = h.topk(most, dim=-1, largest=False).indices
+            G, h, m = G.gather(1, all_rows[..., None].expand(-1, -1, n)), h.gather(1, all_rows), most
+    step = max(1, CHUNK_BYTES // (8 * m ** max(n, 2) * 8))
+    parts = [nearest_on_lines(*part, radius) for part in zip(t.split(step), G.split(step), h.split(step), strict=True)]
+    found = parts[0] if len(parts) == 1 else Nearest(*(torch.cat(x) for x in zip(*parts, strict=True)))
+    if all_rows is None:
+        return found
+    return found._replace(lam=found.lam.new_zeros(B, width).scatter(1, all_rows, found.lam))
+
+
+def _enumerate(t: Tensor, G: Tensor, h: Tensor, impossible: Tensor, radius: float | None, tol: float) -> Raw:
+    """Enumeration of active sets for the samples that the short way does not settle, with the status it leads to."""
+    found = _enumerate_reachable(t, G, h, radius)
+    mu = found.c - 1
+    residual = kkt_residual(None, -t, G, h, found.u, found.lam, mu, radius)
+    residual = torch.where(impossible, torch.inf, residual)
+    part = Raw(found.u, found.lam, mu, found.sizes, residual, found.sizes + 1)
+    return settle(part, torch.where(impossible, torch.inf, found.violation), found.nearest, radius, tol)
 
 
 class Metric:

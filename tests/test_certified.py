@@ -188,6 +188,21 @@ def test_admissible_nominal_action_passes_bit_for_bit(index):
 
 
 @EVERY_WORLD
+def test_every_robot_that_violates_a_row_gets_a_program(index):
+    record = recorded(index)
+    nominal = record.data["nominal_action"]
+    finite = nominal.isfinite().all(-1, keepdim=True)
+    cut = limit_speed(torch.where(finite, nominal, 0.0), record.world.max_speed)
+    some = total = 0
+    for rows, pressed, action in zip(record.rows, record.pressed, cut, strict=True):
+        violates = ((rows.G * action.unsqueeze(-2)).sum(-1) > rows.h).any(-1).flatten()
+        given = torch.zeros_like(violates).index_fill(0, pressed, True)
+        assert not (violates & ~given).any()
+        some, total = some + len(pressed), total + len(given)
+    assert 0 < some < total  # and not simply everybody
+
+
+@EVERY_WORLD
 def test_programs_keep_their_barriers(index):
     """h(k+1) >= (1 - g) h(k) where the program decided, for h_s where the anchor leaves the pair slack."""
     record = recorded(index)

@@ -20,8 +20,8 @@ from envs.homing import (
     is_certified,
     reassign_slots,
     reserve,
-    segment_distance,
 )
+from tests.worlds import segment_distance
 
 FAMILIES = ("linear", "logarithmic")
 

@@ -9,10 +9,10 @@ import torch
 
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.battery import charging_field
-from envs.homing import is_certified, segment_distance
+from envs.homing import is_certified
 from envs.inequalities import derived_quantities, least_clearance, reach
 from safety import SafetyConfig, SafetyFilter
-from tests.worlds import COUNT, draw_worlds, roll_out
+from tests.worlds import COUNT, draw_worlds, roll_out, segment_distance
 
 torch.set_num_threads(1)
 F64 = torch.float64

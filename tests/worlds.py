@@ -159,6 +159,12 @@ def accepted(world, position, energy, stations, alpha_o):
     return current, energy + world.dt * (world.charge_rate * field * current - world.max_drain_rate)
 
 
+def every_robots_rows(position, *args, build=safety.filter.certified_rows, **kwargs):
+    """certified_rows of all robots, not only of those that may violate one: ``G (M, N, m, d), h (M, N, m)``."""
+    rows = build(position, *args, **{**kwargs, "target": None})
+    return rows._replace(G=rows.G.unflatten(0, position.shape[:2]), h=rows.h.unflatten(0, position.shape[:2]))
+
+
 @functools.cache
 def edge_rows(index, batch=48):
     """World ``index``: environment, states at the edge of the set, their slots' places, current and rows."""
@@ -170,7 +176,7 @@ def edge_rows(index, batch=48):
     step = {"gain": alphas.energy * world.dt, "step": world.max_speed * world.dt}
     _, normal, bound = sampled_energy_row(position, energy, worst, home, world.homing, **step)
     limits = {"safety_distance": world.safety_distance, "max_speed": world.max_speed}
-    rows = safety.filter.certified_rows(position, home, normal, bound, env.bounds, world.homing, alphas, **limits)
+    rows = every_robots_rows(position, home, normal, bound, env.bounds, world.homing, alphas, **limits)
     return env, position, energy, slot, home, current, rows
 
 
@@ -253,7 +259,9 @@ class Record:
     data: dict
     """Tensors ``(T, B, ..)`` by short name, what the environment made of them as next_..; (T, B, N) where one number a robot."""
     rows: list
-    """Rows of every step (certified only)."""
+    """Rows of all robots in every step (certified only)."""
+    pressed: list
+    """Which robots the filter solved a program for, in every step (certified only)."""
 
 
 def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, **safety_fields):
@@ -262,12 +270,14 @@ def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, **safety
     safety_filter = SafetyFilter(SafetyConfig(**{**gains, **safety_fields}), world)
     position, energy, slot = edge_states(env, seed)
     td = env.set_state(position, energy.unsqueeze(-1), slot.unsqueeze(-1))
-    adversary, records, rows = Adversary(world, seed, kinds), [], []
+    adversary, records, rows, pressed = Adversary(world, seed, kinds), [], [], []
     build = safety.filter.certified_rows
 
     def keep(*args, **kwargs):
-        rows.append(build(*args, **kwargs))
-        return rows[-1]
+        rows.append(every_robots_rows(*args, build=build, **kwargs))
+        rows_given = build(*args, **kwargs)
+        pressed.append(rows_given.robots)
+        return rows_given
 
     with mock.patch("safety.filter.certified_rows", keep):
         for _ in range(steps):
@@ -282,7 +292,7 @@ def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, **safety
             td = after
     data = {name: torch.stack([record[name] for record in records]) for name in records[0]}
     data = {name: x.squeeze(-1) if x.dim() == 4 and x.shape[-1] == 1 else x for name, x in data.items()}
-    return Record(world, env, safety_filter, data, rows)
+    return Record(world, env, safety_filter, data, rows, pressed)
 
 
 def raw_margins(record):
@@ -345,3 +355,10 @@ def lone_robots(world, way, geometry, *, chord=1.0, steps=100, batch=128):
         position, energy = transition(position, energy, action, full, stations, world)
         energies.append(energy[:, 0])
     return torch.stack(energies)
+
+
+def segment_distance(start, end):
+    """Distance of the origin to the segment from ``start`` to ``end``, ``(..., d), (..., d) -> (...)``."""
+    along = end - start
+    t = (-(start * along).sum(-1) / along.square().sum(-1).clamp_min(1e-30)).clamp(0, 1)
+    return (start + t.unsqueeze(-1) * along).norm(dim=-1)
