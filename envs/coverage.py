@@ -11,6 +11,8 @@ import math
 import torch
 from torch import Tensor
 
+from envs.dynamics import dot
+
 
 def quadrature_points(bounds: list[list[float]], resolution: int, **factory) -> tuple[Tensor, float]:
     """Centres of a regular grid over a box, and the second moment of one cell.
@@ -31,14 +33,14 @@ def quadrature_points(bounds: list[list[float]], resolution: int, **factory) -> 
 def squared_distances(position: Tensor, points: Tensor) -> Tensor:
     """Squared distances of robots and points, ``(*B, N, d), (Q, d) -> (*B, N, Q)``, m^2.
 
-    Written as ``|p|^2 - 2 p.q + |q|^2`` (one matrix product) about the middle of the points, so that an arena far from
+    One matrix product, ``(p, |p|^2, 1) . (-2 q, 1, |q|^2)``, about the middle of the points, so that an arena far from
     the origin loses no digits; with at most rounding below zero removed.
     """
     middle = points.mean(dim=0)
-    position, points = position - middle, points - middle
-    cross = position @ points.T
-    norms = position.square().sum(-1, keepdim=True) + points.square().sum(-1)
-    return (norms - 2 * cross).clamp_min(0)
+    p, q = position - middle, points - middle
+    ones = (torch.ones_like(p[..., :1]), torch.ones_like(q[:, :1]))
+    left = torch.cat([p, dot(p, p).unsqueeze(-1), ones[0]], dim=-1)
+    return (left @ torch.cat([-2 * q, ones[1], dot(q, q).unsqueeze(-1)], dim=-1).T).clamp_min_(0)
 
 
 def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment: float) -> Tensor:
@@ -55,21 +57,30 @@ def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment
 
     Source: Cortes et al., Coverage control for mobile sensing networks (2004): the locational optimisation function.
     """
-    return (squared_distances(position, points).amin(dim=-2) * weights).sum(-1) + cell_moment
+    return weighted_sum(squared_distances(position, points).amin(dim=-2), weights) + cell_moment
 
 
-def voronoi_moments(position: Tensor, points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
+    """Sum over the quadrature points, ``(*B, Q)`` and ``(Q,)`` or ``(*B, Q)`` to ``(*B,)``."""
+    return values @ weights if weights.dim() == 1 else (values * weights).sum(-1)
+
+
+def voronoi_moments(
+    position: Tensor, points: Tensor, weights: Tensor, squared: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Mass and centroid of every robot's Voronoi cell.
 
     Args:
         position: ``(*B, N, d)``, m.
         points: ``(Q, d)``, m.
         weights: ``(Q,)`` or ``(*B, Q)``, summing to 1.
+        squared: their :func:`squared_distances`, if they are known.
 
     Returns:
         Mass ``(*B, N)`` and centroid ``(*B, N, d)``, m; the centroid of a cell without mass is the robot itself.
     """
-    nearest = squared_distances(position, points).argmin(dim=-2, keepdim=True)
+    squared = squared_distances(position, points) if squared is None else squared
+    nearest = squared.argmin(dim=-2, keepdim=True)
     robots = torch.arange(position.shape[-2], device=position.device).unsqueeze(-1)
     owned = (nearest == robots).to(position.dtype) * weights.unsqueeze(-2)
     mass = owned.sum(-1)

@@ -40,6 +40,8 @@ class Density:
         self.n_params = n_points if self.family == "age" else n_centers * (moves + drawn * dimension)
         self.n_observed = AGE_CELLS**dimension if self.family == "age" else n_centers * dimension * (moves or drawn)
         self._cells = self._partition() if self.family == "age" else None
+        constant = self.family == "gaussian_mixture" and not drawn
+        self._constant = self._gaussian_weights(self.centers) if constant else None
 
     def sample(self, batch: int, generator: torch.Generator) -> Tensor:
         """Draw the parameters of ``batch`` new episodes, ``(batch, n_params)``."""
@@ -89,7 +91,11 @@ class Density:
         if self.family == "age":
             importance = params + self.config.dt  # never all zero
             return importance / importance.sum(-1, keepdim=True)
-        offset = self.points.unsqueeze(-2) - self.component_centers(params).unsqueeze(-3)
+        return self._gaussian_weights(self.component_centers(params)) if self._constant is None else self._constant
+
+    def _gaussian_weights(self, centers: Tensor) -> Tensor:
+        """Weights under equal Gaussians around ``centers (*B, K, d)``, ``(*B, Q)``."""
+        offset = self.points.unsqueeze(-2) - centers.unsqueeze(-3)
         exponent = offset.square().sum(-1) * (-0.5 / self.config.density_sigma**2)
         return exponent.logsumexp(-1).softmax(-1)  # finite also where every component underflows
 

@@ -12,13 +12,17 @@ from torchrl.envs import EnvBase
 
 from envs import keys
 from envs.config import SurveillanceConfig
-from envs.coverage import quadrature_points, squared_distances, voronoi_moments
+from envs.coverage import quadrature_points, squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
 from envs.dynamics import limit_speed, other_indices
 from envs.homing import reassign_slots
 from envs.metrics import violations
 from envs.starts import draw_starts
 from envs.transition import transition
+
+
+CHUNK_DISTANCES = 2**20
+"""Squared distances of robots and quadrature points that a step holds at a time."""
 
 
 class SurveillanceEnv(EnvBase):
@@ -74,7 +78,8 @@ class SurveillanceEnv(EnvBase):
         docked = self.slots[: config.n_agents]
         # J_ref is J under the uniform density whatever the family, so it takes the uniform density's cell moment
         _, cell_moment = quadrature_points(config.bounds, config.quadrature_resolution)
-        self.reference_cost = float(self._nearest_squared(docked).mean()) + cell_moment
+        nearest = squared_distances(docked, self.density.points).amin(dim=-2)
+        self.reference_cost = float(nearest.mean()) + cell_moment
         self.generator = torch.Generator(device=device)
         self._make_specs()
         self._set_seed(seed)
@@ -91,7 +96,7 @@ class SurveillanceEnv(EnvBase):
         if mask is None:
             mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         self._write_start(mask.reshape(self.batch_size))
-        out = self._outputs()
+        out = self._outputs(*self._watch(self._state["position"], self._state["density"], advance=False))
         for kind in keys.VIOLATION_KINDS:
             out[(*keys.VIOLATION, kind)] = torch.zeros((*self._robots, 1), dtype=torch.bool, device=self.device)
         return self._with_flags(out, torch.zeros_like(mask).reshape(-1, 1), torch.zeros_like(mask).reshape(-1, 1))
@@ -108,7 +113,7 @@ class SurveillanceEnv(EnvBase):
 
         flags = violations(position, next_position, next_energy, self.slots, config)
         violated = torch.stack(list(flags.values())).any(dim=0).any(dim=-1, keepdim=True)
-        nearest = self._nearest_squared(next_position)
+        watched = self._watch(next_position, state["density"], advance=True)
         slot = state["slot"]
         if config.reassign_slots:
             slot = reassign_slots(next_position, next_energy, slot, self.slots, self.geometry, self.bounds)
@@ -118,12 +123,12 @@ class SurveillanceEnv(EnvBase):
                 "energy": next_energy,
                 "slot": slot,
                 "step": state["step"] + 1,
-                "density": self.density.advance(state["density"], nearest),
+                "density": watched[0],
             },
             self.batch_size,
             device=self.device,
         )
-        out = self._outputs(nearest)
+        out = self._outputs(*watched)
         for kind, flag in flags.items():
             out[(*keys.VIOLATION, kind)] = flag.unsqueeze(-1)
         reward = -out[keys.COVERAGE_COST] / self.reference_cost
@@ -220,18 +225,31 @@ class SurveillanceEnv(EnvBase):
     def _robots(self) -> tuple[int, int]:
         return self.batch_size[0], self.config.n_agents
 
-    def _nearest_squared(self, position: Tensor) -> Tensor:
-        """Squared distance of every quadrature point to the nearest robot, ``(*B, Q)``, m^2."""
-        return squared_distances(position, self.density.points).amin(dim=-2)
+    def _watch(self, position: Tensor, params: Tensor, *, advance: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Density parameters, coverage cost ``(B, 1)`` and, if observed, centroids ``(B, N, d)`` of all worlds.
 
-    def _outputs(self, nearest: Tensor | None = None) -> TensorDict:
-        """All keys that describe the present state; ``nearest`` saves recomputing the Voronoi distances."""
+        The Voronoi distances of a chunk of worlds at a time: their memory is bounded, and they stay in the cache.
+        """
+        density, parts = self.density, []
+        size = max(1, CHUNK_DISTANCES // (position.shape[-2] * len(density.points)))
+        for robots, now in zip(position.split(size), params.split(size), strict=True):
+            squared = squared_distances(robots, density.points)
+            nearest = squared.amin(dim=-2)
+            after = density.advance(now, nearest) if advance else now
+            weights = density.weights(after)
+            cost = weighted_sum(nearest, weights).unsqueeze(-1) + density.cell_moment
+            centroid = robots
+            if self.config.observe_centroid:
+                _, centroid = voronoi_moments(robots, density.points, weights, squared)
+            parts.append((after, cost, centroid))
+        params, cost, centroid = parts[0] if len(parts) == 1 else (torch.cat(x) for x in zip(*parts, strict=True))
+        return params, cost, centroid if self.config.observe_centroid else None
+
+    def _outputs(self, params: Tensor, cost: Tensor, centroid: Tensor | None) -> TensorDict:
+        """All keys that describe the present state, given what :meth:`_watch` returned of it."""
         state = self._state
-        nearest = self._nearest_squared(state["position"]) if nearest is None else nearest
-        weights = self.density.weights(state["density"])
-        cost = (nearest * weights).sum(-1, keepdim=True) + self.density.cell_moment
         out = {
-            keys.OBSERVATION: self._observe(weights),
+            keys.OBSERVATION: self._observe(params, centroid),
             keys.POSITION: state["position"].clone(),
             keys.ENERGY: state["energy"].unsqueeze(-1).clone(),
             keys.SLOT: state["slot"].unsqueeze(-1).clone(),
@@ -239,10 +257,10 @@ class SurveillanceEnv(EnvBase):
             keys.STEP_COUNT: state["step"].clone(),
         }
         if self.density.n_params:
-            out[keys.DENSITY] = state["density"].clone()
+            out[keys.DENSITY] = params.clone()
         return TensorDict(out, self.batch_size, device=self.device)
 
-    def _observe(self, weights: Tensor) -> Tensor:
+    def _observe(self, params: Tensor, centroid: Tensor | None) -> Tensor:
         c, state = self.config, self._state
         position: Tensor = state["position"]
         length = c.length_scale
@@ -258,12 +276,11 @@ class SurveillanceEnv(EnvBase):
             share[:, self._others],
         ]
         if self.density.n_observed:
-            fields.append(self.density.observe(state["density"]).unsqueeze(-2).expand(*self._robots, -1))
+            fields.append(self.density.observe(params).unsqueeze(-2).expand(*self._robots, -1))
         if c.horizon:
             time = (state["step"].to(share.dtype) / c.horizon).clamp_max(1)
             fields.append(time.unsqueeze(-2).expand(*self._robots, 1))
-        if c.observe_centroid:
-            _, centroid = voronoi_moments(position, self.density.points, weights)
+        if centroid is not None:
             fields.append((centroid - position) / length)
         return torch.cat(fields, dim=-1)
 
