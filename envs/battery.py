@@ -7,6 +7,8 @@ is the Euler map with the field taken at the start of the step.
 import torch
 from torch import Tensor
 
+from envs.dynamics import length
+
 
 def charging_field(position: Tensor, stations: Tensor, *, full_radius: float, zero_radius: float) -> Tensor:
     """Charging field ``w(p) = max_s w(||p - S_s||)``: 1 up to ``full_radius``, smoothstep to 0 at ``zero_radius``.
@@ -20,7 +22,7 @@ def charging_field(position: Tensor, stations: Tensor, *, full_radius: float, ze
     Returns:
         ``(*B, N)``, in [0, 1].
     """
-    distance = (position.unsqueeze(-2) - stations).norm(dim=-1).amin(dim=-1)
+    distance = length(position.unsqueeze(-2) - stations).amin(dim=-1)
     t = ((zero_radius - distance) / (zero_radius - full_radius)).clamp(0, 1)
     return t * t * (3 - 2 * t)
 

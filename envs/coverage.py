@@ -30,17 +30,18 @@ def quadrature_points(bounds: list[list[float]], resolution: int, **factory) -> 
     return points, math.fsum(((high - low) / resolution) ** 2 / 12 for low, high in bounds)
 
 
-def squared_distances(position: Tensor, points: Tensor) -> Tensor:
+def squared_distances(position: Tensor, points: Tensor, *, clamp: bool = True) -> Tensor:
     """Squared distances of robots and points, ``(*B, N, d), (Q, d) -> (*B, N, Q)``, m^2.
 
     One matrix product, ``(p, |p|^2, 1) . (-2 q, 1, |q|^2)``, about the middle of the points, so that an arena far from
-    the origin loses no digits; with at most rounding below zero removed.
+    the origin loses no digits. ``clamp`` removes what rounding leaves below zero.
     """
     middle = points.mean(dim=0)
     p, q = position - middle, points - middle
     ones = (torch.ones_like(p[..., :1]), torch.ones_like(q[:, :1]))
     left = torch.cat([p, dot(p, p).unsqueeze(-1), ones[0]], dim=-1)
-    return (left @ torch.cat([-2 * q, ones[1], dot(q, q).unsqueeze(-1)], dim=-1).T).clamp_min_(0)
+    squared = left @ torch.cat([-2 * q, ones[1], dot(q, q).unsqueeze(-1)], dim=-1).T
+    return squared.clamp_min(0) if clamp else squared
 
 
 def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment: float) -> Tensor:

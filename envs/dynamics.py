@@ -5,6 +5,8 @@ import functools
 import torch
 from torch import Tensor
 
+TINY_SQUARE = 1e-37  # below it a squared length is 0
+
 
 def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
     """Scale velocities outside the speed ball onto it; others are returned bit for bit.
@@ -16,9 +18,9 @@ def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
     Returns:
         ``(*B, N, d)``, m/s, norm at most ``max_speed``.
     """
-    speed = velocity.norm(dim=-1, keepdim=True)
+    speed = dot(velocity, velocity).clamp_min(TINY_SQUARE).sqrt().unsqueeze(-1)  # a gradient of 0 at rest, not NaN
     # Cut to a hair below the limit: rounding must not lift a norm above it, and a velocity cut once is not cut again.
-    return torch.where(speed > max_speed, velocity * (max_speed * (1 - 1e-6) / speed.clamp_min(1e-30)), velocity)
+    return torch.where(speed > max_speed, velocity * (max_speed * (1 - 1e-6) / speed), velocity)
 
 
 def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
@@ -56,6 +58,11 @@ def own_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     number = torch.zeros(n_agents, n_agents, dtype=torch.int64, device=device)
     number[i, j] = number[j, i] = torch.arange(len(i), device=device)
     return number[robots, others], (robots > others).to(torch.int64)
+
+
+def length(x: Tensor) -> Tensor:
+    """Norm over a short last dimension, as :func:`dot`; its gradient at 0 is NaN: for what is not differentiated."""
+    return dot(x, x).sqrt()
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, pair_indices
+from envs.dynamics import length, pair_indices
 
 TINY = 1e-30  # below it a length is 0
 EXCHANGES = 4  # exchanges of slots whose certificate is tried in a step
@@ -92,7 +92,7 @@ def homing_velocity(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     offset = slot_position - position
     if geometry.family == "logarithmic":
         return geometry.gain * offset
-    distance = offset.norm(dim=-1, keepdim=True)
+    distance = length(offset).unsqueeze(-1)
     return offset * torch.clamp(geometry.speed / distance.clamp_min(TINY), max=1 / geometry.dt)
 
 
@@ -177,9 +177,7 @@ def closest_moments(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     """:func:`closest_pieces` with both robots' way to go; arguments as :func:`closest_approach`."""
     pieces = closest_pieces(position, slot_position, geometry)
     offset = position - slot_position
-    distance = torch.stack(
-        [dot(offset, offset).sqrt()[..., x] for x in pair_indices(position.shape[-2], position.device)]
-    )
+    distance = torch.stack([length(offset)[..., x] for x in pair_indices(position.shape[-2], position.device)])
     share, slope = way_to_go(distance, pieces.time.unsqueeze(1), geometry)
     return ClosestMoments(pieces.distance, pieces.relative, share, slope)
 
@@ -201,7 +199,7 @@ def _relative_path(
     """
     i, j = pair_indices(position.shape[-2], position.device)
     offset = position - slot_position
-    distance = dot(offset, offset).sqrt()
+    distance = length(offset)
     direction = (offset / distance.clamp_min(TINY).unsqueeze(-1)).movedim(-1, 0)  # (d, *B, N)
     whole = (distance / (geometry.speed * geometry.dt)).floor()
     n_i, n_j = whole[..., i], whole[..., j]
@@ -242,7 +240,7 @@ def certified_robots(
         ``(*B, N)`` bool; NaN fails.
     """
     offset = position - slot_position
-    distance = dot(offset, offset).sqrt()
+    distance = length(offset)
     spare = energy - geometry.energy_min - margins * geometry.eps_energy - reserve(distance, geometry)
     wall = (3 - margins) / 2 * geometry.eps_distance  # a robot at the wall must not leave the set by one rounding
     inside = ((position >= bounds[:, 0] - wall) & (position <= bounds[:, 1] + wall)).all(dim=-1)
@@ -308,7 +306,7 @@ def best_exchanges(
         ``(*B, count, N)`` int64, each one-to-one, the best one first.
     """
     n_slots = slots.shape[0]
-    way = (position.unsqueeze(-2) - slots).norm(dim=-1)  # robot i to slot s: (*B, N, S)
+    way = length(position.unsqueeze(-2) - slots)  # robot i to slot s: (*B, N, S)
     affordable = energy.unsqueeze(-1) - geometry.energy_min - 2 * geometry.eps_energy >= reserve(way, geometry)
     cost = torch.where(affordable, way.square(), torch.inf)
     own_way = way.gather(-1, slot.unsqueeze(-1)).square()  # (*B, N, 1)

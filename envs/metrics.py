@@ -29,34 +29,45 @@ def violations(
     Returns:
         ``{kind: (*B, N) bool}`` for the kinds of :data:`envs.keys.VIOLATION_KINDS`.
     """
-    way = (next_position.unsqueeze(-2) - slots).norm(dim=-1).amin(dim=-1)
+    way = _length(next_position.unsqueeze(-2) - slots).amin(dim=-1)
     needed = config.drain_rate * (way - config.break_even_radius).clamp_min(0) / config.max_speed
-    gap = _step_gap(position, next_position)
-    n_agents = position.shape[-2]
-    itself = torch.eye(n_agents, dtype=torch.bool, device=position.device)
+    close = ~(_step_gap(position, next_position) >= config.safety_distance)
+    i, j = _pairs(position)
+    collision = torch.zeros_like(next_energy, dtype=torch.int64)
+    collision = collision.index_add(-1, i, close.to(torch.int64)).index_add(-1, j, close.to(torch.int64))
     flags = (
         ~(next_energy >= config.energy_min),
         ~(next_energy - config.energy_min >= needed),
         ~(next_energy <= config.energy_max),
-        (~(gap >= config.safety_distance) & ~itself).any(dim=-1),
+        collision > 0,
     )
     return dict(zip(VIOLATION_KINDS, flags, strict=True))
 
 
+def _pairs(position: Tensor) -> tuple[Tensor, Tensor]:
+    i, j = torch.triu_indices(position.shape[-2], position.shape[-2], offset=1, device=position.device)
+    return i, j
+
+
+def _length(x: Tensor) -> Tensor:
+    """Norm over the last dimension; sums over the short dimension itself are slow."""
+    return sum(component.square() for component in x.unbind(-1)).sqrt()
+
+
 def _step_gap(position: Tensor, next_position: Tensor) -> Tensor:
-    """Least distance of every two robots over the step, ``(*B, N, N)``: closest point of the relative segment to 0."""
-    start = position.unsqueeze(-2) - position.unsqueeze(-3)
-    move = next_position.unsqueeze(-2) - next_position.unsqueeze(-3) - start
-    length = move.square().sum(-1)
-    t = torch.where(length > 0, -(start * move).sum(-1) / length.clamp_min(1e-30), torch.zeros_like(length)).clamp(0, 1)
-    return (start + t.unsqueeze(-1) * move).norm(dim=-1)
+    """Least distance of every pair of robots over the step, ``(*B, P)``: closest point of the relative segment to 0."""
+    i, j = _pairs(position)
+    start = position[..., i, :] - position[..., j, :]
+    move = next_position[..., i, :] - next_position[..., j, :] - start
+    long = move.square().sum(-1)
+    t = torch.where(long > 0, -(start * move).sum(-1) / long.clamp_min(1e-30), torch.zeros_like(long)).clamp(0, 1)
+    return _length(start + t.unsqueeze(-1) * move)
 
 
 def minimum_distance(position: Tensor, next_position: Tensor) -> Tensor:
     """Least distance of any two robots over the step, ``(*B,)``, m; inf for one robot."""
     gap = _step_gap(position, next_position)
-    itself = torch.eye(position.shape[-2], dtype=torch.bool, device=position.device)
-    return torch.where(itself, torch.inf, gap).flatten(-2).amin(dim=-1)
+    return torch.nn.functional.pad(gap, (0, 1), value=torch.inf).amin(dim=-1)
 
 
 class ChargeCounter:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from envs.config import SurveillanceConfig
+from envs.dynamics import length
 from envs.homing import HomingGeometry, exchange_slots, is_certified, reserve
 
 DRAWS = 16  # candidates per world
@@ -43,7 +44,7 @@ def draw_starts(
     top = config.energy_max - geometry.eps_energy
     span = config.energy_max - config.energy_min
     least = min(config.energy_min + 2 * geometry.eps_energy + config.reset_reserve * span, top)
-    need = least + reserve((position - slots[slot]).norm(dim=-1), geometry)
+    need = least + reserve(length(position - slots[slot]), geometry)
     energy = need + (top - need).clamp_min(0) * share
     certified = is_certified(position, energy, slots[slot], geometry, bounds, clearance=config.reset_clearance)
     certified &= (need <= top).all(dim=-1)

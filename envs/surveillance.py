@@ -20,7 +20,6 @@ from envs.metrics import violations
 from envs.starts import draw_starts
 from envs.transition import transition
 
-
 CHUNK_DISTANCES = 2**20
 """Squared distances of robots and quadrature points that a step holds at a time."""
 
@@ -233,8 +232,8 @@ class SurveillanceEnv(EnvBase):
         density, parts = self.density, []
         size = max(1, CHUNK_DISTANCES // (position.shape[-2] * len(density.points)))
         for robots, now in zip(position.split(size), params.split(size), strict=True):
-            squared = squared_distances(robots, density.points)
-            nearest = squared.amin(dim=-2)
+            squared = squared_distances(robots, density.points, clamp=False)
+            nearest = squared.amin(dim=-2).clamp_min(0)
             after = density.advance(now, nearest) if advance else now
             weights = density.weights(after)
             cost = weighted_sum(nearest, weights).unsqueeze(-1) + density.cell_moment

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from envs.battery import charge, charging_field, power
 from envs.config import SurveillanceConfig
-from envs.dynamics import integrate
+from envs.dynamics import integrate, length
 
 
 def transition(
@@ -26,7 +26,7 @@ def transition(
     c = config
     field = charging_field(position, stations, full_radius=c.charge_radius_full, zero_radius=c.charge_radius)
     drain = power(
-        velocity.norm(dim=-1),
+        length(velocity),
         drain_rate=c.drain_rate,
         per_speed=c.drain_per_speed,
         per_speed_squared=c.drain_per_speed_squared,

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from envs.dynamics import length
 from envs.homing import HomingGeometry, reserve
 
 
@@ -59,7 +60,7 @@ def energy_barrier(
     Source: Notomista & Egerstedt, Persistification of Robotic Tasks, arXiv 1903.05810.
     """
     offset = position - slot_position
-    distance = offset.norm(dim=-1)
+    distance = length(offset)
     radius = geometry.charge_radius
     outside = distance > radius
     if geometry.family == "linear":
@@ -106,7 +107,7 @@ def sampled_energy_row(
         ``h_c (*B, N)``, row normal ``(*B, N, d)`` (s m) and bound ``(*B, N)`` (m^2) of ``normal . u <= bound``.
     """
     offset = position - slot_position
-    distance = offset.norm(dim=-1)
+    distance = length(offset)
     floor = geometry.energy_min + 2 * geometry.eps_energy
     value = energy - floor - reserve(distance, geometry)
     if geometry.family == "linear":

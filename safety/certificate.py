@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, limit_speed, own_pairs, pair_indices
+from envs.dynamics import length, limit_speed, own_pairs, pair_indices
 from envs.homing import (
     TINY,
     ClosestMoments,
@@ -71,7 +71,7 @@ def pair_gradients(moments: ClosestMoments, position: Tensor, slot_position: Ten
 def from_slot(position: Tensor, slot_position: Tensor) -> Tensor:
     """Directions ``e`` from the slots to the robots, 0 in the slot."""
     offset = position - slot_position
-    return offset / dot(offset, offset).sqrt().clamp_min(TINY).unsqueeze(-1)
+    return offset / length(offset).clamp_min(TINY).unsqueeze(-1)
 
 
 def anchors(
@@ -106,12 +106,12 @@ def anchors(
     n = position.shape[1]
     i, j = pair_indices(n, position.device)
     home = homing_velocity(position, slot_position, geometry)
-    length = chord_normal.norm(dim=-1).clamp_min(TINY)
+    size = length(chord_normal).clamp_min(TINY)
     critical = chord_bound < 0
     # a hair more than the least speed, as the row is met with equality; only limited where C has been left
-    least = (-chord_bound / length * (1 + 1e-6)).clamp(0, max_speed)
-    speed = torch.maximum(home.norm(dim=-1), least)
-    fast = -chord_normal * (speed / length).unsqueeze(-1)
+    least = (-chord_bound / size * (1 + 1e-6)).clamp(0, max_speed)
+    speed = torch.maximum(length(home), least)
+    fast = -chord_normal * (speed / size).unsqueeze(-1)
     homing, moving = torch.where(critical.unsqueeze(-1), fast, home), critical
     for _ in range(n + 1):
         chosen = torch.where(moving.unsqueeze(-1), homing, 0.0)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, own_pairs, pair_indices
+from envs.dynamics import dot, length, own_pairs, pair_indices
 from envs.homing import TINY, ClosestPieces, HomingGeometry, closest_moments, closest_pieces, way_to_go
 from safety.certificate import anchors, from_slot, pair_gradients
 from safety.config import Gains
@@ -74,7 +74,7 @@ def certified_rows(
     pieces = closest_pieces(position, slot_position, geometry)
     i, j = pair_indices(n, device)
     gap = position[:, i] - position[:, j]
-    now, later = dot(gap, gap).sqrt(), pieces.distance
+    now, later = length(gap), pieces.distance
     spare = (later - geometry.clearance - geometry.eps_distance).clamp_min(0)
     # a class-K function that is flat at 0: what the linearisation of G misses near the limit is of second order too
     decrease = gains.certificate * spare.square() / (spare + step)
@@ -126,12 +126,12 @@ def _pressed(
     """Robots that may violate a row at their target, ``(M, N)`` bool: none that does is missing, NaN is among them."""
     n = target.shape[1]
     away = target - anchor
-    fine = dot(chord_normal, target) + HAIR * dot(chord_normal, chord_normal).sqrt() * max_speed <= chord_bound
+    fine = dot(chord_normal, target) + HAIR * length(chord_normal) * max_speed <= chord_bound
     fine = fine & (torch.cat([target, -target], dim=-1) + HAIR * max_speed <= room).all(dim=-1)
     if n > 1:
         least = slack.amin(dim=0)[:, own_pairs(n, target.device)[0]].amin(dim=-1)
         # the normals are no longer than 1
-        fine = fine & (2 * (1 + HAIR) * dot(away, away).sqrt() <= least)
+        fine = fine & (2 * (1 + HAIR) * length(away) <= least)
     return ~fine
 
 
@@ -166,14 +166,14 @@ def _own_rows(
     pair, side = (x[robots % n] for x in own_pairs(n, robots.device))  # (K, N - 1)
     half = slack[:, world, pair].clamp_min(0).movedim(0, 1).flatten(1) / 2  # (K, (1 + S) (N - 1))
     # the normals are no longer than 1, so such a row holds for every action
-    idle = half >= max_speed + dot(anchor, anchor).sqrt().unsqueeze(-1)
+    idle = half >= max_speed + length(anchor).unsqueeze(-1)
     count = int((~idle).sum(-1).max()) if half.numel() else 0
     half, entry = half.topk(count, dim=-1, largest=False)
     piece, other = entry // others, entry % others
     own, second = pair.gather(1, other), side.gather(1, other)  # (K, R)
     relative, distance = pieces.relative[piece, :, world, own], pieces.distance[piece, world, own]
     offset = position - slot_position
-    share, slope = way_to_go(dot(offset, offset).sqrt().unsqueeze(-1), pieces.time[piece, world, own], geometry)
+    share, slope = way_to_go(length(offset).unsqueeze(-1), pieces.time[piece, world, own], geometry)
     e, normal = from_slot(position, slot_position).unsqueeze(1), relative / distance.clamp_min(TINY).unsqueeze(-1)
     gradient = share.unsqueeze(-1) * normal + ((slope - share) * dot(e, normal)).unsqueeze(-1) * e
     normals = torch.where((second == 0).unsqueeze(-1), -gradient, gradient)

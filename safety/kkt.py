@@ -12,6 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from envs.dynamics import length
+
 
 class QPStatus(IntEnum):
     """What is known about a returned value; only SOLVED values may be executed."""
@@ -59,8 +61,8 @@ class Raw(NamedTuple):
 
 
 def norm(x: Tensor) -> Tensor:
-    """Euclidean norm over the last dimension."""
-    return torch.linalg.vector_norm(x, dim=-1)
+    """Euclidean norm over the last dimension; over two or three components torch's own is slow."""
+    return torch.linalg.vector_norm(x, dim=-1) if x.shape[-1] > 3 else length(x)
 
 
 def column_norm(x: Tensor) -> Tensor:
@@ -114,17 +116,20 @@ def kkt_residual(
     Returns:
         (B,) residual; +inf where anything is not finite.
     """
-    Qu = u if Q is None else (Q @ u[..., None])[..., 0]
-    free = norm(p) if Q is None else norm(torch.linalg.solve_ex(Q, p[..., None])[0][..., 0])
+    pull, size = norm(p), norm(u)
+    if Q is None:
+        Qu, free, force = u, pull, torch.maximum(pull, size)
+    else:
+        Qu = (Q @ u[..., None])[..., 0]
+        free, force = norm(torch.linalg.solve_ex(Q, p[..., None])[0][..., 0]), torch.maximum(pull, norm(Qu))
     free = free if radius is None else free.clamp(max=radius)
-    force = torch.maximum(norm(p), norm(Qu)).clamp(min=TINY)
-    length = torch.maximum(norm(u), SCALE_FLOOR * free).clamp(min=TINY)
-    gradient = Qu + p + (G * lam[..., None]).sum(1) + mu[:, None] * u
-    slack = (h - (G * u[:, None]).sum(-1)) / length[:, None]
-    dual = lam / force[:, None]
-    worst = torch.maximum(norm(gradient) / force, torch.minimum(dual, slack).abs().amax(-1))
+    force, scale = force.clamp(min=TINY), torch.maximum(size, SCALE_FLOOR * free).clamp(min=TINY)
+    gradient = Qu + p + (lam[:, None] @ G)[:, 0] + mu[:, None] * u
+    slack = (h - (G @ u[..., None])[..., 0]) / scale[:, None]
+    worst = torch.minimum(lam / force[:, None], slack).abs_().amax(-1)
+    worst = torch.maximum(norm(gradient) / force, worst)
     if radius is not None:
-        gap = (radius - norm(u)) / radius
+        gap = 1 - size / radius
         worst = torch.maximum(worst, torch.minimum(mu * radius / force, gap).abs())
     return torch.where(torch.isfinite(worst), worst, torch.inf)
 
