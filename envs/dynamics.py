@@ -60,6 +60,20 @@ def own_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     return number[robots, others], (robots > others).to(torch.int64)
 
 
+def components_first(x: Tensor) -> Tensor:
+    """The same tensor ``(..., d)`` with its components stored one after the other.
+
+    Loops run along the memory: over a short last dimension, every broadcast along it (a norm, a mask) costs ten times
+    what it does over long runs. Elementwise results keep the order.
+    """
+    return x.movedim(-1, 0).contiguous().movedim(0, -1)
+
+
+def batch_last(x: Tensor) -> Tensor:
+    """The same tensor ``(B, ...)`` with the batch's elements stored next to each other, as :func:`components_first`."""
+    return x.permute(*reversed(range(x.dim()))).contiguous().permute(*reversed(range(x.dim())))
+
+
 def length(x: Tensor) -> Tensor:
     """Norm over a short last dimension, as :func:`dot`; its gradient at 0 is NaN: for what is not differentiated."""
     return dot(x, x).sqrt()

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import length, pair_indices
+from envs.dynamics import dot, length, pair_indices
 
 TINY = 1e-30  # below it a length is 0
 EXCHANGES = 4  # exchanges of slots whose certificate is tried in a step
@@ -341,13 +341,29 @@ def reassign_slots(
     Returns:
         ``(*B, N)`` int64, one-to-one.
     """
+    flat = position.flatten(0, -3), energy.flatten(0, -2), slot.flatten(0, -2)
+    index = _may_exchange(flat[0], flat[2], slots).nonzero().squeeze(-1)
+    some_position, some_energy, some_slot = (x[index] for x in flat)
     count = min(EXCHANGES, slot.shape[-1] * len(slots))
-    candidates = best_exchanges(position, energy, slot, slots, geometry, count)
-    # few worlds have an exchange to offer in a step, and few of its kinds
-    some = (candidates != slot.unsqueeze(-2)).any(dim=-1).nonzero(as_tuple=True)
-    world = some[:-1]
+    candidates = best_exchanges(some_position, some_energy, some_slot, slots, geometry, count)
+    # few kinds of exchange have anything to offer
+    some = (candidates != some_slot.unsqueeze(-2)).any(dim=-1).nonzero(as_tuple=True)
     adopt = torch.zeros(candidates.shape[:-1], dtype=torch.bool, device=slot.device)
-    adopt[some] = is_certified(position[world], energy[world], slots[candidates[some]], geometry, bounds)
+    home = slots[candidates[some]]
+    adopt[some] = is_certified(some_position[some[0]], some_energy[some[0]], home, geometry, bounds)
     first = adopt.to(torch.uint8).argmax(dim=-1, keepdim=True)
     chosen = candidates.gather(-2, first.unsqueeze(-1).expand(*first.shape, slot.shape[-1])).squeeze(-2)
-    return torch.where(adopt.any(dim=-1, keepdim=True), chosen, slot)
+    chosen = torch.where(adopt.any(dim=-1, keepdim=True), chosen, some_slot)
+    return flat[2].index_copy(0, index, chosen).view_as(slot)
+
+
+def _may_exchange(position: Tensor, slot: Tensor, slots: Tensor) -> Tensor:
+    """Worlds in which an exchange may shorten the squared way home, ``(M,)``; all worlds that have one are among them."""
+    home = slots[slot]
+    i, j = pair_indices(slot.shape[-1], slot.device)
+    # |p_i - s_i|^2 + |p_j - s_j|^2 - |p_i - s_j|^2 - |p_j - s_i|^2 = -2 (p_i - p_j) . (s_i - s_j)
+    some = (dot(position[:, i] - position[:, j], home[:, i] - home[:, j]) < 0).any(dim=-1)
+    if len(slots) > slot.shape[-1]:  # a free slot
+        nearest = length(position.unsqueeze(-2) - slots).amin(dim=-1)
+        some = some | (nearest < length(position - home)).any(dim=-1)
+    return some

@@ -14,7 +14,7 @@ from envs import keys
 from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
-from envs.dynamics import limit_speed, other_indices
+from envs.dynamics import components_first, limit_speed, other_indices
 from envs.homing import reassign_slots
 from envs.metrics import violations
 from envs.starts import draw_starts
@@ -102,8 +102,8 @@ class SurveillanceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config, state = self.config, self._state
-        position, energy = state["position"], state["energy"]
-        velocity = limit_speed(tensordict[keys.ACTION].to(position.dtype), config.max_speed)
+        position, energy = components_first(state["position"]), state["energy"]
+        velocity = limit_speed(components_first(tensordict[keys.ACTION].to(position.dtype)), config.max_speed)
         if config.on_violation == "continue":
             velocity = torch.where((energy < config.energy_min).unsqueeze(-1), 0.0, velocity)
         current = tensordict.get(keys.CHARGE_CURRENT, None)

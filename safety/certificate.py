@@ -52,17 +52,25 @@ def closest_approach_gradient(
     """
     moments = closest_moments(position, slot_position, geometry)
     least, index = moments.distance.min(dim=0, keepdim=True)
-    gradients = pair_gradients(moments, position, slot_position)
+    pair = torch.stack(pair_indices(position.shape[-2], position.device))
+    e = from_slot(position, slot_position).movedim(-1, 0)[..., pair].movedim(-2, 0)  # (2, d, *B, P)
+    gradients = pair_gradients(moments, e)
     wide = index[:, None, None].expand(1, *gradients.shape[1:])
     first, second = gradients.gather(0, wide).squeeze(0).movedim(1, -1)
     return least.squeeze(0), first, second
 
 
-def pair_gradients(moments: ClosestMoments, position: Tensor, slot_position: Tensor) -> Tensor:
-    """Gradients of the pieces' distances with respect to i's and to j's position, ``(S, 2, d, *B, P)``."""
-    pair = torch.stack(pair_indices(position.shape[-2], position.device))
-    e = from_slot(position, slot_position).movedim(-1, 0)[..., pair].movedim(-2, 0)  # (2, d, *B, P)
-    normal = (moments.relative / moments.distance.clamp_min(TINY).unsqueeze(1)).unsqueeze(1)  # (S, 1, d, *B, P)
+def pair_gradients(moments: ClosestMoments, e: Tensor) -> Tensor:
+    """Gradients of the pieces' distances with respect to i's and to j's position.
+
+    Args:
+        moments: of the pairs ``...``.
+        e: directions of i and j from their slots, ``(2, d, ...)``.
+
+    Returns:
+        ``(S, 2, d, ...)``.
+    """
+    normal = (moments.relative / moments.distance.clamp_min(TINY).unsqueeze(1)).unsqueeze(1)  # (S, 1, d, ...)
     along = (moments.slope - moments.share) * (e * normal).sum(2)
     gradient = moments.share.unsqueeze(2) * normal + along.unsqueeze(2) * e
     return torch.stack([gradient[:, 0], -gradient[:, 1]], dim=1)
@@ -79,8 +87,9 @@ def anchors(
     chord_bound: Tensor,
     position: Tensor,
     slot_position: Tensor,
-    pair_normals: Tensor,
-    pair_slack: Tensor,
+    members: tuple[Tensor, Tensor, Tensor],
+    normals: Tensor,
+    slack: Tensor,
     geometry: HomingGeometry,
     max_speed: float,
 ) -> tuple[Tensor, Tensor]:
@@ -95,16 +104,16 @@ def anchors(
         chord_bound: ``(M, N)``, its bound.
         position: ``(M, N, d)``, m.
         slot_position: ``(M, N, d)``, m.
-        pair_normals: ``(M, K, 2, P, d)``: row k of pair p is ``normals[k, 0] . u_i + normals[k, 1] . u_j <= slack[k]``.
-        pair_slack: ``(M, K, P)``, slack of both standing still.
+        members: world, robot i and robot j of the E pairs that need looking at, ``(E,)`` int64 each.
+        normals: ``(K, 2, d, E)``: row k of a pair is ``normals[k, 0] . u_i + normals[k, 1] . u_j <= slack[k]``.
+        slack: ``(K, E)``, slack of both standing still.
         geometry: constants of the backup motion.
         max_speed: m/s.
 
     Returns:
-        Anchor ``(M, N, d)`` m/s and the slack it leaves ``(M, K, P)``.
+        Anchor ``(M, N, d)`` m/s and the slack it leaves ``(K, E)``.
     """
-    n = position.shape[1]
-    i, j = pair_indices(n, position.device)
+    world, i, j = members
     home = homing_velocity(position, slot_position, geometry)
     size = length(chord_normal).clamp_min(TINY)
     critical = chord_bound < 0
@@ -113,14 +122,17 @@ def anchors(
     speed = torch.maximum(length(home), least)
     fast = -chord_normal * (speed / size).unsqueeze(-1)
     homing, moving = torch.where(critical.unsqueeze(-1), fast, home), critical
-    for _ in range(n + 1):
+    for _ in range(position.shape[1] + 1):
         chosen = torch.where(moving.unsqueeze(-1), homing, 0.0)
-        slack = pair_slack - _pair_use(pair_normals, chosen, i, j)
-        tight = (slack < 0).any(dim=1) & ~(moving[:, i] & moving[:, j])
-        if not tight.any():
+        both = torch.stack([chosen[world, i].mT, chosen[world, j].mT])  # (2, d, E)
+        left = slack - (normals * both).sum((1, 2))
+        tight = (left < 0).any(dim=0) & ~(moving[world, i] & moving[world, j])
+        index = tight.nonzero().squeeze(-1)
+        if not len(index):
             break
-        moving = moving | _either(tight, n)
-    return chosen, slack
+        moving = moving.clone()
+        moving[world[index], i[index]] = moving[world[index], j[index]] = True
+    return chosen, left
 
 
 def outside(
@@ -215,12 +227,6 @@ def pair_minimum(pairs: Tensor, n: int) -> Tensor:
 def _by_level(action: Tensor, home: Tensor, level: Tensor) -> Tensor:
     level = level.unsqueeze(-1)
     return torch.where(level == 0, action, torch.where(level == HOMING, home, 0.0))
-
-
-def _pair_use(normals: Tensor, action: Tensor, i: Tensor, j: Tensor) -> Tensor:
-    """Left side of the pairs' rows at a joint action: ``(M, K, 2, P, d), (M, N, d) -> (M, K, P)``."""
-    both = torch.stack([action[:, i], action[:, j]], dim=1).unsqueeze(1)
-    return (normals * both).sum((2, 4))
 
 
 def _either(pairs: Tensor, n: int) -> Tensor:

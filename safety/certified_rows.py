@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, length, own_pairs, pair_indices
-from envs.homing import TINY, ClosestPieces, HomingGeometry, closest_moments, closest_pieces, way_to_go
+from envs.dynamics import components_first, dot, length, own_pairs, pair_indices
+from envs.homing import TINY, ClosestMoments, ClosestPieces, HomingGeometry, closest_pieces, way_to_go
 from safety.certificate import anchors, from_slot, pair_gradients
 from safety.config import Gains
 
@@ -84,14 +84,23 @@ def certified_rows(
     present = (now, gap.movedim(-1, 0), torch.zeros_like(now))
     pieces = ClosestPieces(*(torch.cat([x.unsqueeze(0), y]) for x, y in zip(present, pieces, strict=True)))
     anchor = torch.zeros_like(position)
-    critical = (chord_bound < 0).any(dim=-1).nonzero().squeeze(-1)
-    if anchored and len(critical):  # elsewhere all may stand: their slack is not negative
-        states = (chord_normal[critical], chord_bound[critical], position[critical], slot_position[critical])
-        along = -pair_gradients(closest_moments(*states[2:], geometry), *states[2:])
-        first = -gap[critical].movedim(-1, 0) / now[critical].clamp_min(TINY)
-        normals = torch.cat([torch.stack([first, -first]).unsqueeze(0), along]).permute(3, 0, 1, 4, 2)
-        anchor[critical], left = anchors(*states, normals, slack[:, critical].movedim(1, 0), geometry, max_speed)
-        slack[:, critical] = left.movedim(0, 1)
+    critical = (chord_bound < 0).any(dim=-1, keepdim=True)
+    if anchored and bool(critical.any()):  # elsewhere all may stand: their slack is not negative
+        # no anchor uses up more than twice the limit; beyond six times it what is left holds for every action
+        near = critical & (slack.amin(dim=0) < 6 * max_speed)
+        world, pair = near.nonzero(as_tuple=True)
+        members = (world, i[pair], j[pair])
+        e = from_slot(position, slot_position)
+        e = torch.stack([e[world, x].mT for x in members[1:]])  # (2, d, E)
+        way = torch.stack([length(position - slot_position)[world, x] for x in members[1:]])
+        time = pieces.time[:, world, pair].unsqueeze(1)
+        moments = ClosestMoments(
+            pieces.distance[:, world, pair], pieces.relative[:, :, world, pair], *way_to_go(way, time, geometry)
+        )
+        arguments = (chord_normal, chord_bound, position, slot_position, members, -pair_gradients(moments, e))
+        anchor, left = anchors(*arguments, slack[:, world, pair], geometry, max_speed)
+        slack = torch.where(critical & ~near, slack - 2 * max_speed, slack)
+        slack[:, world, pair] = left
     room = torch.cat([bounds[:, 1] - position, position - bounds[:, 0]], dim=-1).clamp_min(0) / geometry.dt
     if target is None:
         robots = torch.arange(position.shape[0] * n, device=device)
@@ -171,7 +180,7 @@ def _own_rows(
     half, entry = half.topk(count, dim=-1, largest=False)
     piece, other = entry // others, entry % others
     own, second = pair.gather(1, other), side.gather(1, other)  # (K, R)
-    relative, distance = pieces.relative[piece, :, world, own], pieces.distance[piece, world, own]
+    relative, distance = components_first(pieces.relative[piece, :, world, own]), pieces.distance[piece, world, own]
     offset = position - slot_position
     share, slope = way_to_go(length(offset).unsqueeze(-1), pieces.time[piece, world, own], geometry)
     e, normal = from_slot(position, slot_position).unsqueeze(1), relative / distance.clamp_min(TINY).unsqueeze(-1)

@@ -26,7 +26,7 @@ from torch import Tensor
 from envs import keys
 from envs.battery import charge, charging_field
 from envs.config import SurveillanceConfig
-from envs.dynamics import limit_speed, other_indices, pair_indices
+from envs.dynamics import components_first, limit_speed, other_indices, pair_indices
 from envs.transition import transition
 from safety.barriers import (
     BarrierRow,
@@ -112,7 +112,8 @@ class SafetyFilter(TensorDictModuleBase):
         Returns:
             The tensors of ``out_keys``.
         """
-        nominal, energy = nominal.to(position.dtype), energy.to(position.dtype)
+        nominal, energy = components_first(nominal.to(position.dtype)), energy.to(position.dtype)
+        position = components_first(position)
         finite = nominal.isfinite().all(dim=-1)
         target = limit_speed(torch.where(finite.unsqueeze(-1), nominal, 0.0), self.world.max_speed)
         if self.safety.mode == "certified":
@@ -158,7 +159,7 @@ class SafetyFilter(TensorDictModuleBase):
         fullest = charge(energy, field, current, rest, charge_rate=world.charge_rate, dt=world.dt)
         current = torch.where(fullest > world.energy_max, 0.0, current)
         next_energy = energy + world.dt * (world.charge_rate * field * current - geometry.drain_rate)
-        flat = [x.reshape(-1, *shape[-2:]) for x in (target, position, slots[slot])]
+        flat = [x.reshape(-1, *shape[-2:]) for x in (target, position, components_first(slots[slot]))]
         flat += [x.reshape(-1, shape[-2]) for x in (energy, next_energy, current, finite)]
         target, position, home, energy, next_energy, flat_current, finite = flat
         h_c, normal, bound = sampled_energy_row(

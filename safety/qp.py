@@ -8,12 +8,15 @@ Q is symmetric positive definite (only its symmetric part matters), `dual` holds
 Qu + p + Gᵀλ + μu = 0, μ ≥ 0 belonging to the ball. h = +inf means no constraint, a zero row is ignored if h ≥ 0 and
 makes the sample INFEASIBLE otherwise. Every tensor may have any batch shape; they are broadcast against each other.
 
-Two solvers, the same guarantees:
+Four solvers, the same guarantees:
 
 * "exact", n ≤ 3: enumeration of active sets (safety/qp_exact.py); `project_halfspaces_ball` is its hot path.
+* "active_set", any n: dual active-set method (safety/qp_active_set.py), for the joint problems of many robots.
+* "pdipm", any n: interior-point method with n x n systems (safety/qp_pdipm.py), then the active set of the rows near its
+  solution. Slower, but its steps hardly grow with the number of active rows.
 * "qpth", any n: the batched interior-point method of Amos & Kolter, "OptNet" (ICML 2017). Stock qpth is silently wrong
   on up to a third of barrier QPs, mostly for a fault in its step length; the guard mends that, scales the problem, caps
-  slack bounds, polishes the active set, and checks against the problem as it was given.
+  slack bounds, polishes the active set, and checks against the problem as it was given. Kept as a reference.
 
 Whatever the solver, the KKT residual of the given problem, recomputed in float64, decides SOLVED; see `KKT_TOL`. All
 arithmetic is float64 inside, so float32 results are correctly rounded solutions for the float32 data (the residual is
@@ -35,15 +38,19 @@ import torch
 from qpth.solvers.pdipm import batch as pdipm
 from torch import Tensor
 
-from safety.kkt import QPStatus, Raw, kkt_residual, norm, normalise_rows, pivoted_basis
+from safety.kkt import QPStatus, Raw, kkt_residual, norm, normalise_rows
+from safety.qp_active_set import active_set
 from safety.qp_exact import CHUNK_BYTES, Metric, settle, solve_exact
+from safety.qp_joint import differentiate, polish, solve_joint
+from safety.qp_pdipm import interior_point
 
 __all__ = ["KKT_TOL", "QPSolution", "QPStatus", "project_halfspaces_ball", "solve_qp"]
 
 KKT_TOL = {torch.float32: 1e-6, torch.float64: 1e-7}
 """Largest relative KKT residual (`safety.kkt.kkt_residual`) that counts as SOLVED, by dtype of the input."""
 
-_SOLVERS = ("exact", "qpth")
+_JOINT = {"active_set": active_set, "pdipm": interior_point}
+_SOLVERS = ("exact", "qpth", *_JOINT)
 _CAP = 1.5  # slack rows end up at this multiple of the most they can need, given the bound on |u|
 _BOUND_FACTORS = (1.0, 1.0, 10.0, 2.0, 100.0, 0.5, 1000.0, 3.0)
 """Bounds on |u| to try, over the a-priori one. 1 comes twice: one sample that breaks down stops qpth for its whole batch."""
@@ -62,7 +69,8 @@ class QPSolution(NamedTuple):
         status: (*B,) int64, a `QPStatus`.
         residual: (*B,) relative KKT residual.
         iterations: (*B,) int64; "exact": active-set sizes enumerated (0: the unconstrained minimiser was feasible), or
-            steps of the ball multiplier search; "qpth": interior-point solves, as qpth does not tell its iterations.
+            steps of the ball multiplier search; "active_set" and "pdipm": iterations (0: the same); "qpth":
+            interior-point solves, as qpth does not tell its iterations.
     """
 
     value: Tensor
@@ -83,14 +91,14 @@ def solve_qp(
         G: (*B, m, n), m ≥ 0.
         h: (*B, m), +inf for no constraint.
         radius: radius of the ball, unit of u; None for no ball.
-        solver: "exact" (n ≤ 3) or "qpth" (any n, no ball).
+        solver: "exact" (n ≤ 3), "active_set", "pdipm" or "qpth" (any n, no ball).
 
     Returns:
         The solution; `value` is differentiable in all four tensors, gradients of unbatched inputs are summed.
 
     Raises:
-        ValueError: unknown solver, a radius that is not finite and positive or given to qpth, n > 3 for the exact
-            solver, shapes that do not fit, mixed or unsupported dtypes, mixed devices.
+        ValueError: unknown solver, a radius that is not finite and positive or given to another than the exact
+            solver, n > 3 for that one, shapes that do not fit, mixed or unsupported dtypes, mixed devices.
     """
     if solver not in _SOLVERS:
         raise ValueError(f"unknown solver {solver!r}, allowed: {', '.join(_SOLVERS)}")
@@ -162,23 +170,37 @@ def _solve_flat(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float
     """Solve a flat batch of any floating dtype in float64; samples with non-finite input are set aside."""
     tol = KKT_TOL[p.dtype]
     if Q is not None:
-        Q = Q.double()
-        Q = (Q + Q.mT) / 2
+        shared = len(Q) > 1 and Q.stride(0) == 0  # expanded: one matrix to look at
+        Q = (Q[:1] if shared else Q).double()
+        Q = ((Q + Q.mT) / 2).expand(len(p), -1, -1)
     p, G, h = p.double(), G.double(), h.double()
-    good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
-    if Q is not None:
-        good = good & Q.isfinite().all(-1).all(-1)
-    index = good.nonzero()[:, 0]
-    if len(index) < len(good):
+    index, count = None, len(p)
+    # A sum is finite only if all its terms are, and ten times cheaper than asking each.
+    if not all(bool(x.sum().isfinite()) for x in (Q, p, G) if x is not None) or not bool((h > -torch.inf).all()):
+        good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
+        if Q is not None:
+            good = good & Q.isfinite().all(-1).all(-1)
+        index = good.nonzero()[:, 0]
         Q, p, G, h = None if Q is None else Q[index], p[index], G[index], h[index]
-    part = _solve_qpth(Q, p, G, h, tol) if solver == "qpth" and Q is not None else solve_exact(Q, p, G, h, radius, tol)
-    if len(index) == len(good):
+    if Q is None or solver == "exact":
+        part = solve_exact(Q, p, G, h, radius, tol)
+    elif solver == "qpth":
+        part = _solve_qpth(Q, p, G, h, tol)
+    else:
+        part = solve_joint(None if _is_identity(Q) else Q, p, G, h, tol, _JOINT[solver])
+    if index is None:
         return part
-    raw = Raw.blank(part.u.new_zeros(len(good), part.u.shape[-1]), part.lam.shape[-1])
+    raw = Raw.blank(part.u.new_zeros(count, part.u.shape[-1]), part.lam.shape[-1])
     raw.status.fill_(QPStatus.INACCURATE.value)
     raw.residual.fill_(torch.inf)
     raw.put(index, part)
     return raw
+
+
+def _is_identity(Q: Tensor) -> bool:
+    """Whether every matrix of (B, n, n) is the identity."""
+    Q = Q[:1] if Q.stride(0) == 0 else Q
+    return bool((torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device) == Q).all())
 
 
 class _SolveQP(torch.autograd.Function):
@@ -202,43 +224,13 @@ class _SolveQP(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        """Solve [[Q + μI, Aᵀ, u], [A, 0, 0], [uᵀ, 0, 0]] (dz, dλ, dμ) = -(grad, 0, 0), A the active rows.
-
-        Then dp = dz, dQ = ½(dz uᵀ + u dzᵀ), dG_i = λ_i dz + dλ_i u, dh_i = -dλ_i.
-        """
+        """Gradients by implicit differentiation, see `differentiate`."""
         Q, p, G, u, lam, mu, status = ctx.saved_tensors
         solved = status == QPStatus.SOLVED.value
-        grad = torch.where(solved[:, None], grads[0], 0.0)
-        dp, dG, dh = -grad, torch.zeros_like(G), torch.zeros_like(G[..., 0])
-        dQ = None if Q is None else torch.zeros_like(Q)
-        # For the projection everything but the pinned samples is done: their gradient is the identity, exactly.
-        index = (solved if Q is not None else solved & ((lam > 0).any(-1) | (mu > 0))).nonzero()[:, 0]
-        if len(index):
-            tol = KKT_TOL[p.dtype]
-            g, A, u, lam, mu = grad[index].double(), G[index].double(), u[index], lam[index], mu[index]
-            eye = torch.eye(u.shape[-1], dtype=u.dtype, device=u.device)
-            H = eye.expand(len(u), -1, -1) if Q is None else (Q[index] + Q[index].mT).double() / 2
-            p64 = p[index].double()
-            force = torch.maximum(norm(p64), norm((H @ u[..., None])[..., 0]))[:, None]
-            big = A.abs().amax(-1).clamp(min=1e-300)
-            size = big * norm(A / big[..., None])
-            size = torch.where(size > 0, size, 1.0)
-            length = norm(u).clamp(min=1e-300)[:, None]
-            rows = torch.cat([A / size[..., None], (u / length)[:, None]], 1)
-            active = torch.cat([lam * size, mu[:, None] * length], 1) > tol * force
-            metric = Metric(H + mu[:, None, None] * eye, rows)
-            basis = pivoted_basis(metric.rows, active)
-            g = metric.down(g)
-            dz = -metric.up(basis.project(g))
-            dy = torch.linalg.solve_triangular(basis.R, -(basis.axes @ g[..., None]), upper=True)[..., 0]
-            dlam = (torch.zeros_like(metric.scale).scatter_add(1, basis.picks, dy) / metric.scale)[:, :-1] / size
-            dp[index] = dz.to(dp.dtype)
-            dG[index] = (lam[..., None] * dz[:, None] + dlam[..., None] * u[:, None]).to(dG.dtype)
-            dh[index] = -dlam.to(dh.dtype)
-            if dQ is not None:
-                outer = dz[..., None] * u[:, None]
-                dQ[index] = ((outer + outer.mT) / 2).to(dQ.dtype)
-        return dQ, dp, dG, dh, None, None
+        rows_too = ctx.needs_input_grad[2] or ctx.needs_input_grad[3]
+        identity = Q is None or _is_identity(Q)
+        result = differentiate(Q, p, G, u, lam, mu, solved, grads[0], KKT_TOL[p.dtype], identity, rows_too)
+        return *result, None, None
 
 
 def _step_to_boundary(v: Tensor, dv: Tensor) -> Tensor:
@@ -262,23 +254,6 @@ def _interior_point(Q: Tensor, p: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor,
         parts.append((torch.zeros_like(c), torch.zeros_like(b), torch.ones_like(b)) if x is None else (x, z, s))
     x, z, s = (torch.cat(column) for column in zip(*parts, strict=True))
     return torch.nan_to_num(x, 0.0, 0.0, 0.0), torch.nan_to_num(z, 0.0, 0.0, 0.0), torch.nan_to_num(s, 1.0, 1.0, 1.0)
-
-
-def _polish(t: Tensor, G: Tensor, h: Tensor, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Projection of t on the planes of the rows that interior-point calls active (z > s), and its multipliers."""
-    active = z > s
-    basis = pivoted_basis(G, active, z.clamp(min=1e-12))
-    dead, picks = ~basis.axes.any(-1), basis.picks
-    bound = torch.where(dead, 0.0, h.gather(1, picks))
-    y = torch.linalg.solve_triangular(basis.R.mT, bound[..., None], upper=False)
-    w = basis.project(t) + (basis.axes * y).sum(1)
-    lam = torch.linalg.solve_triangular(basis.R, basis.axes @ t[..., None] - y, upper=True)[..., 0]
-    # An equality is a pair of opposite rows with any multipliers of the right difference: the other one may be meant.
-    picked = G.gather(1, picks[..., None].expand(-1, -1, G.shape[-1]))
-    cosine, other = torch.where(active[:, None], picked @ G.mT, 1.0).min(-1)
-    flip = (lam < 0) & (cosine < -1 + 1e-9)
-    picks, lam = torch.where(flip, other, picks), torch.where(dead, 0.0, torch.where(flip, -lam, lam))
-    return w, torch.zeros_like(h).scatter_add(1, picks, lam)
 
 
 def _prove_infeasible(G: Tensor, h: Tensor) -> Tensor:
@@ -334,7 +309,7 @@ def _solve_qpth(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, tol: float) -> Raw:
         s = (reach[todo] * factor)[:, None]
         b = torch.where(idle[todo], 1.0, torch.minimum(bound[todo] / s, _CAP * rows[todo].abs().sum(-1)))
         x, z, slack = _interior_point(eye.expand(len(todo), -1, -1).contiguous(), -t[todo] / s, rows[todo], b)
-        for w, dual in ((x * s, z * s), _polish(t[todo], rows[todo], bound[todo], z, slack)):
+        for w, dual in ((x * s, z * s), polish(t[todo], rows[todo], bound[todo], z > slack, z.clamp(min=1e-12))):
             u, lam = metric.up(w, todo), dual / metric.scale[todo]
             residual = kkt_residual(Q[todo], p[todo], G[todo], h[todo], u, lam, torch.zeros_like(reach[todo]), None)
             better = residual < raw.residual[todo]

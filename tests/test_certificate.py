@@ -231,16 +231,17 @@ def test_pairs_without_slack_drive_home_together():
     drained = energy - world.dt * world.drain_rate
     _, normal, bound = sampled_energy_row(position, energy, drained, home, g, gain=0.2, step=0.04)
     q = position[:, [0, 0, 1]] - position[:, [1, 2, 2]]
-    normals = torch.stack([-2 * q, 2 * q], 1).unsqueeze(1)
-    slack = (q.square().sum(-1) - world.safety_distance**2)[:, None] / world.dt
-    chosen, left = anchors(normal, bound, position, home, normals, slack, g, world.max_speed)
+    normals = torch.stack([-2 * q[0].T, 2 * q[0].T]).unsqueeze(0)
+    slack = (q[0].square().sum(-1) - world.safety_distance**2)[None] / world.dt
+    members = (torch.zeros(3, dtype=torch.int64), *torch.triu_indices(3, 3, 1))
+    chosen, left = anchors(normal, bound, position, home, members, normals, slack, g, world.max_speed)
     assert (bound < 0).tolist() == [[False, True, False]]
     speed = homing_velocity(position, home, g)
     assert torch.equal(chosen[0, ::2], torch.stack([speed[0, 0], torch.zeros(2, dtype=F64)]))
     assert chosen[0, 1, 0] >= speed[0, 1, 0]
-    by_hand = slack[0, 0] + 2 * (q[0] * (chosen[0, [0, 0, 1]] - chosen[0, [1, 2, 2]])).sum(-1)
-    torch.testing.assert_close(left[0, 0], by_hand)
-    assert slack[0, 0, 0] < 2 * q[0, 0, 0] * speed[0, 1, 0]  # negative had the one ahead stood still
+    by_hand = slack[0] + 2 * (q[0] * (chosen[0, [0, 0, 1]] - chosen[0, [1, 2, 2]])).sum(-1)
+    torch.testing.assert_close(left[0], by_hand)
+    assert slack[0, 0] < 2 * q[0, 0, 0] * speed[0, 1, 0]  # negative had the one ahead stood still
 
 
 # ---- the shield ---------------------------------------------------------------------------------------------------------

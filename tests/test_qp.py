@@ -10,6 +10,7 @@ import torch
 from qpth.qp import QPFunction
 from scipy import sparse
 
+import safety.enumeration as enumeration
 import safety.qp_exact as qp_exact
 from safety.qp import KKT_TOL, QPStatus, project_halfspaces_ball, solve_qp
 
@@ -420,6 +421,7 @@ def test_chunks_change_nothing(monkeypatch):
     _, p, G, h = problems(100, 6, 3, "slack", seed=9)
     whole = project_halfspaces_ball(-p, G, h, 1.0)
     monkeypatch.setattr(qp_exact, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(enumeration, "CHUNK_BYTES", 1)
     for a, b in zip(whole, project_halfspaces_ball(-p, G, h, 1.0), strict=True):
         torch.testing.assert_close(a, b)
 
