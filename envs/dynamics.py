@@ -16,7 +16,8 @@ def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
         max_speed: radius of the ball, m/s.
 
     Returns:
-        ``(*B, N, d)``, m/s, norm at most ``max_speed``.
+        ``(*B, N, d)``, m/s, norm at most ``max_speed`` (to a rounding: where it is the limit, another order of
+        summation may find the next number).
     """
     speed = dot(velocity, velocity).clamp_min(TINY_SQUARE).sqrt().unsqueeze(-1)  # a gradient of 0 at rest, not NaN
     # Cut to a hair below the limit: rounding must not lift a norm above it, and a velocity cut once is not cut again.

@@ -5,7 +5,8 @@ from torch import Tensor
 
 from envs.config import SurveillanceConfig
 from envs.dynamics import length
-from envs.homing import HomingGeometry, exchange_slots, is_certified, reserve
+from envs.homing import HomingGeometry, is_certified, reserve
+from envs.reassignment import exchange_slots
 
 DRAWS = 16  # candidates per world
 

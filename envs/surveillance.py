@@ -15,8 +15,8 @@ from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
 from envs.dynamics import components_first, limit_speed, other_indices
-from envs.homing import reassign_slots
 from envs.metrics import violations
+from envs.reassignment import reassign_slots
 from envs.starts import draw_starts
 from envs.transition import transition
 

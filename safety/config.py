@@ -50,7 +50,7 @@ class SafetyConfig:
     alpha_g: float | None = None
     """Class-K gain of the homing certificate far from its limit, 1/s, (0, 1/dt]; null = 1/dt. certified only."""
     solver: str = "auto"
-    """auto: exact for one robot's problem, qpth for the joint one. exact | qpth choose."""
+    """auto: exact for one robot's problem, active_set for the joint one. exact | active_set | pdipm | qpth choose."""
     in_loss: bool = False
     """Put the filter into the policy that the loss differentiates (gradient through the QP), and into its target."""
 
@@ -59,7 +59,7 @@ class SafetyConfig:
         check_choice("safety.mode", self.mode, ("certified", "paper", "none"))
         check_choice("safety.composition", self.composition, ("stacked", "min"))
         check_choice("safety.split", self.split, ("auto", "anchor", "half", "full", "joint"))
-        check_choice("safety.solver", self.solver, ("auto", "exact", "qpth"))
+        check_choice("safety.solver", self.solver, ("auto", "exact", "active_set", "pdipm", "qpth"))
         certified = self.mode == "certified"
         if certified and (self.composition != "stacked" or not self.sampled_data):
             raise ValueError(
@@ -79,7 +79,7 @@ class SafetyConfig:
         if self.split == "joint" and self.solver == "exact":
             raise ValueError(
                 "safety.solver='exact' solves one robot's problem (2 or 3 variables), safety.split='joint' has all robots': "
-                "choose safety.solver=qpth or safety.split=half."
+                "choose safety.solver=active_set or safety.split=half."
             )
 
     def gains(self, world: SurveillanceConfig) -> Gains:

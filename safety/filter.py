@@ -26,7 +26,7 @@ from torch import Tensor
 from envs import keys
 from envs.battery import charge, charging_field
 from envs.config import SurveillanceConfig
-from envs.dynamics import components_first, limit_speed, other_indices, pair_indices
+from envs.dynamics import components_first, limit_speed, other_indices
 from envs.transition import transition
 from safety.barriers import (
     BarrierRow,
@@ -40,7 +40,7 @@ from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
 from safety.certified_rows import Rows, certified_rows
 from safety.config import SafetyConfig
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
-from safety.speed_faces import speed_faces
+from safety.speed_faces import joint_rows, speed_faces
 
 
 class SafetyFilter(TensorDictModuleBase):
@@ -77,6 +77,7 @@ class SafetyFilter(TensorDictModuleBase):
         # The literature's reserve: full speed, no sampled-data margin.
         self.literal = dataclasses.replace(world.homing, speed=world.max_speed, gain=world.max_speed / world.diameter)
         self.geometry = world.homing
+        self._joint_solver = "active_set" if safety.solver in ("auto", "exact") else safety.solver
         self.in_keys = [keys.NOMINAL_ACTION, keys.POSITION, keys.ENERGY, keys.SLOT]
         self.out_keys = [
             *(keys.ACTION, keys.CHARGE_CURRENT, keys.CORRECTION, keys.STATUS, keys.LEVEL, keys.RESIDUAL),
@@ -255,13 +256,13 @@ class SafetyFilter(TensorDictModuleBase):
     def _solve_per_robot(self, target: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One problem per robot: ``target (*B, d)``, ``G (*B, m, d)``, ``h (*B, m)``."""
         radius = self.world.max_speed
-        if self.safety.solver == "qpth":
+        if self.safety.solver not in ("auto", "exact"):
             faces, offset = speed_faces(target.shape[-1], radius)
             faces = torch.tensor(faces, dtype=target.dtype, device=target.device)
             G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)
             h = torch.cat([h, h.new_full((*h.shape[:-1], len(faces)), offset)], dim=-1)
             identity = torch.eye(target.shape[-1], dtype=target.dtype, device=target.device)
-            solution = solve_qp(identity, -target, G, h, solver="qpth")
+            solution = solve_qp(identity, -target, G, h, solver=self.safety.solver)
         else:
             # half of limit_speed's hair: cut targets stay as they are, and rounding stays inside the ball
             solution = project_halfspaces_ball(target, G, h, radius * (1 - 5e-7))
@@ -272,39 +273,20 @@ class SafetyFilter(TensorDictModuleBase):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One problem per world over all N d velocities; its status and residual are every robot's."""
         n, d = target.shape[-2:]
-        G, h = self._joint_rows(gain_c, bound_c, gain_s, bound_s)
+        G, h = joint_rows(gain_c, bound_c, gain_s, bound_s, self.world.max_speed)
         identity = torch.eye(n * d, dtype=target.dtype, device=target.device)
         if target.requires_grad:
             # robot i's gradient flows through its own nominal action only: N copies, the neighbours' detached
             own = torch.eye(n, dtype=torch.bool, device=target.device).unsqueeze(-1)
             nominal = torch.where(own, target.unsqueeze(-3), target.detach().unsqueeze(-3)).flatten(-2)
-            solution = solve_qp(identity, -nominal, G.unsqueeze(-3), h.unsqueeze(-2), solver="qpth")
+            solution = solve_qp(identity, -nominal, G.unsqueeze(-3), h.unsqueeze(-2), solver=self._joint_solver)
             diagonal = torch.arange(n, device=target.device)
             action = solution.value.unflatten(-1, (n, d))[..., diagonal, diagonal, :]
             return action, solution.status, solution.residual
-        solution = solve_qp(identity, -target.flatten(-2), G, h, solver="qpth")
+        solution = solve_qp(identity, -target.flatten(-2), G, h, solver=self._joint_solver)
         shape = target.shape[:-1]
         action = solution.value.unflatten(-1, (n, d))
         return action, solution.status.unsqueeze(-1).expand(shape), solution.residual.unsqueeze(-1).expand(shape)
-
-    def _joint_rows(self, gain_c: Tensor, bound_c: Tensor, gain_s: Tensor, bound_s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows of the joint problem: N survivability, P collision, then the faces of every robot's speed polytope."""
-        n, d = gain_c.shape[-2:]
-        batch = gain_c.shape[:-2]
-        i, j = pair_indices(n, gain_c.device)
-        pairs = torch.arange(len(i), device=gain_c.device)
-        pair_rows = gain_c.new_zeros(*batch, len(i), n, d)
-        pair_rows[..., pairs, i, :] = gain_s[..., i, j, :]
-        pair_rows[..., pairs, j, :] = gain_s[..., j, i, :]
-        eye = torch.eye(n, dtype=gain_c.dtype, device=gain_c.device)
-        own_rows = eye.unsqueeze(-1) * gain_c.unsqueeze(-2)
-        faces, offset = speed_faces(d, self.world.max_speed)
-        faces = torch.tensor(faces, dtype=gain_c.dtype, device=gain_c.device)
-        face_rows = torch.einsum("ij,fd->ifjd", eye, faces).flatten(0, 1).expand(*batch, -1, n, d)
-        # a pair's row is asked for if either robot's composite is that pair
-        bound_pair = torch.minimum(bound_s[..., i, j], bound_s[..., j, i])
-        G = torch.cat([own_rows, pair_rows, face_rows], dim=-3).flatten(-2)
-        return G, torch.cat([bound_c, bound_pair, gain_c.new_full((*batch, face_rows.shape[-3]), offset)], dim=-1)
 
     def solve_task(self, Q: Tensor, p: Tensor, position: Tensor, energy: Tensor, slot: Tensor) -> Tensor:
         """Joint quadratic program of a task controller under this filter's rows; hold where it cannot be solved.
@@ -323,8 +305,9 @@ class SafetyFilter(TensorDictModuleBase):
         alpha_c, alpha_o, alpha_s, _ = self.gains
         current, _ = accepted_current(h_o, alpha_o)
         bound_c = h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
-        G, h = self._joint_rows(-h_c.velocity_gain, bound_c, -h_s.velocity_gain, alpha_s * h_s.value)
-        solution = solve_qp(Q, p, G, h, solver="qpth")
+        gains = (-h_c.velocity_gain, bound_c, -h_s.velocity_gain, alpha_s * h_s.value)
+        G, h = joint_rows(*gains, self.world.max_speed)
+        solution = solve_qp(Q, p, G, h, solver=self._joint_solver)
         solved = (solution.status == QPStatus.SOLVED).unsqueeze(-1)
         return torch.where(solved, solution.value, 0.0).unflatten(-1, position.shape[-2:])
 

@@ -35,7 +35,8 @@ def test_no_promise_is_broken_in_any_world(world_seed, seed, kinds):
     assert robots.all()
     assert pairs.all()
     assert (d["next_slot"].sort(-1).values.diff(dim=-1) > 0).all()
-    assert d["action"].norm(dim=-1).max() <= world.max_speed
+    ulp = torch.finfo(world.torch_dtype).eps  # norms summed in another order
+    assert d["action"].norm(dim=-1).max() <= world.max_speed * (1 + ulp)
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])

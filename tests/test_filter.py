@@ -476,7 +476,7 @@ def test_gain_beyond_one_over_dt_is_refused(name):
         ({"mode": "certified", "composition": "min"}, r"safety\.mode=certified.*safety\.composition=min"),
         ({"mode": "certified", "sampled_data": False}, r"safety\.mode=certified.*safety\.sampled_data=False"),
         ({"composition": "max", "sampled_data": False}, r"safety\.composition='max'.*stacked, min"),
-        ({"solver": "pdipm"}, r"safety\.solver='pdipm'.*auto, exact, qpth"),
+        ({"solver": "osqp"}, r"safety\.solver='osqp'.*auto, exact, active_set, pdipm, qpth"),
     ],
 )
 def test_configuration_that_cannot_be_is_refused(fields, message):

@@ -12,15 +12,12 @@ from hypothesis import strategies as st
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.battery import charging_field
 from envs.homing import (
-    EXCHANGES,
-    best_exchanges,
     closest_approach,
-    exchange_slots,
     homing_velocity,
     is_certified,
-    reassign_slots,
     reserve,
 )
+from envs.reassignment import EXCHANGES, best_exchanges, exchange_slots, reassign_slots
 from tests.worlds import segment_distance
 
 FAMILIES = ("linear", "logarithmic")
