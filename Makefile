@@ -32,4 +32,4 @@ format: venv
 	$(BIN)/ruff format .
 
 bench: venv
-	$(BIN)/python -m pytest -q -s -m benchmark tests/benchmarks $(ARGS)
+	@for name in qp filter env_step update; do $(BIN)/python tests/benchmarks/bench_$$name.py --seconds 5 $(ARGS) || exit 1; done

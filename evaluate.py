@@ -48,7 +48,7 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed)
+    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile=config.compile)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)
@@ -57,7 +57,7 @@ def main(cfg: DictConfig) -> None:
     else:
         name = config.controller or ""
         nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
-    policy = TensorDictSequential(nominal, SafetyFilter(safety, world))
+    policy = TensorDictSequential(nominal, SafetyFilter(safety, world, compile=config.compile))
     steps = config.steps or rollout_steps(world.horizon)
     asked = {
         "steps": steps,

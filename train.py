@@ -51,11 +51,12 @@ def main(cfg: DictConfig) -> None:
     start, device = time.perf_counter(), pick_device(config.device)
     env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
     torch.manual_seed(config.seed)
-    env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed)
-    eval_env = SurveillanceEnv(config.env, config.eval.num_envs, device)
+    env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed, compile=config.compile)
+    eval_env = SurveillanceEnv(config.env, config.eval.num_envs, device, compile=config.compile)
     actor = make_actor(env.n_observation, config.env, config.agent).to(device)
     critic = make_critic(env.n_observation, config.env, config.agent).to(device)
-    policy, explore_policy = make_policies(actor, config.env, config.safety, config.agent, noise_seed, device)
+    policies = make_policies(actor, config.env, config.safety, config.agent, noise_seed, device, compile=config.compile)
+    policy, explore_policy = policies
     loss_module, target_updater = make_loss(actor, critic, config.agent, config.safety, config.env)
     optimizers = make_optimizers(loss_module, config.agent)
     minibatches = config.env.n_agents if config.agent.minibatch == "per_agent" else 1

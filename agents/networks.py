@@ -186,6 +186,8 @@ def make_policies(
     agent: AgentConfig,
     seed: int,
     device: torch.device,
+    *,
+    compile: bool = False,
 ) -> tuple[TensorDictSequential, TensorDictSequential]:
     """Deployment policy ``actor -> filter`` and exploration policy ``actor -> noise -> filter``.
 
@@ -196,10 +198,11 @@ def make_policies(
         agent: the noise.
         seed: seed of the noise.
         device: of the noise's generator.
+        compile: the filter's pure functions, see :class:`safety.SafetyFilter`.
 
     Returns:
         ``(policy, explore_policy)``; both execute filtered actions only.
     """
-    safety_filter = SafetyFilter(safety, world)
+    safety_filter = SafetyFilter(safety, world, compile=compile)
     noise = ExplorationNoise(agent, world, seed, device)
     return TensorDictSequential(actor, safety_filter), TensorDictSequential(actor, noise, safety_filter)

@@ -4,6 +4,8 @@ A thin shell: physics, batteries, coverage, densities and homing geometry are pu
 modules; this file packs specs and keys, steps all worlds at once and resets by mask.
 """
 
+import functools
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -11,6 +13,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs import keys
+from envs.compilation import compiled
 from envs.config import SurveillanceConfig
 from envs.coverage import quadrature_points, squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
@@ -49,6 +52,7 @@ class SurveillanceEnv(EnvBase):
         num_envs: number of worlds B, >= 1.
         device: where the state lives.
         seed: seed of the environment's own random generator.
+        compile: run transition and violation counting through torch.compile; same results to rounding.
 
     Raises:
         ValueError: if ``num_envs < 1``.
@@ -60,6 +64,8 @@ class SurveillanceEnv(EnvBase):
         num_envs: int = 1,
         device: torch.device | str | None = None,
         seed: int | None = 0,
+        *,
+        compile: bool = False,  # the command line's word
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
@@ -73,6 +79,8 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
+        self._transition = compiled(functools.partial(transition, config=config), enabled=compile)
+        self._violations = compiled(functools.partial(violations, config=config), enabled=compile)
         self._others = other_indices(config.n_agents, device)
         docked = self.slots[: config.n_agents]
         # J_ref is J under the uniform density whatever the family, so it takes the uniform density's cell moment
@@ -110,7 +118,7 @@ class SurveillanceEnv(EnvBase):
         current = torch.ones_like(energy) if current is None else current.squeeze(-1).to(energy.dtype)
         next_position, next_energy = self.transition(position, energy, velocity, current)
 
-        flags = violations(position, next_position, next_energy, self.slots, config)
+        flags = self._violations(position, next_position, next_energy, self.slots)
         violated = torch.stack(list(flags.values())).any(dim=0).any(dim=-1, keepdim=True)
         watched = self._watch(next_position, state["density"], advance=True)
         slot = state["slot"]
@@ -188,7 +196,7 @@ class SurveillanceEnv(EnvBase):
         Returns:
             ``(B, N, d)`` and ``(B, N)``.
         """
-        return transition(position, energy, velocity, current, self.stations, self.config)
+        return self._transition(position, energy, velocity, current, self.stations)
 
     # ---- start states ----------------------------------------------------------------------------------------------
     def _write_start(self, mask: Tensor) -> None:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from envs import keys
 from envs.battery import charge, charging_field
+from envs.compilation import compiled
 from envs.config import SurveillanceConfig
 from envs.dynamics import components_first, limit_speed, other_indices
 from envs.transition import transition
@@ -61,6 +62,7 @@ class SafetyFilter(TensorDictModuleBase):
     Args:
         safety: which filter.
         world: the world it stands in.
+        compile: run the transition that the shield checks through torch.compile; same results to rounding.
 
     The position's type and device are the filter's; other inputs are converted to its type.
 
@@ -69,7 +71,7 @@ class SafetyFilter(TensorDictModuleBase):
         KeyError: from ``forward``, if an input key is missing.
     """
 
-    def __init__(self, safety: SafetyConfig, world: SurveillanceConfig) -> None:
+    def __init__(self, safety: SafetyConfig, world: SurveillanceConfig, *, compile: bool = False) -> None:
         super().__init__()
         self.safety = safety
         self.world = world
@@ -85,6 +87,7 @@ class SafetyFilter(TensorDictModuleBase):
         ]
         if safety.mode == "certified":
             self.out_keys.append(keys.BARRIER_CERTIFICATE)
+        self._transition = compiled(functools.partial(transition, config=world), enabled=compile)
         self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -150,7 +153,6 @@ class SafetyFilter(TensorDictModuleBase):
         """Programs and shield: ``(action, current, status, residual, level, h_c, h_o, h_s, outside, h_g)``."""
         world, geometry, shape = self.world, self.geometry, target.shape
         stations, slots, bounds = self._layout(position)
-        step = functools.partial(transition, stations=stations, config=world)
         field = self._field(position)
         rates = {"drain_rate": world.drain_rate, "charge_rate": world.charge_rate}
         h_o = overcharge_barrier(energy, field, energy_max=world.energy_max - geometry.eps_energy, **rates)
@@ -182,7 +184,8 @@ class SafetyFilter(TensorDictModuleBase):
         level = torch.where(status == QPStatus.SOLVED, 0, HOLD)
         level = torch.where(beyond, HOMING, level)
         action, level, _ = shield(
-            *(step, position, energy, home, action, flat_current, level, rows.closest, geometry, bounds),
+            lambda *state: self._transition(*state, stations),
+            *(position, energy, home, action, flat_current, level, rows.closest, geometry, bounds),
             max_speed=world.max_speed,
         )
         least = pair_minimum(torch.cat([rows.closest, rows.distance]), shape[-2])

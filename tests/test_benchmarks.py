@@ -1,0 +1,74 @@
+"""The benchmark programs run and print their tables, at tiny sizes. No time is ever asserted."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parent / "benchmarks"
+TINY = ["--batches", "4", "--robots", "2", "--repeats", "1"]
+
+
+@pytest.fixture
+def load(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setenv("RAYON_NUM_THREADS", "1")  # restored afterwards: the programs set it
+    return importlib.import_module
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "titles"),
+    [
+        ("bench_qp", ["--problems", "joint"], ["Joint problems, d = 2"]),
+        ("bench_qp", ["--dimension", "3", "--problems", "robot"], ["One problem per robot, d = 3"]),
+        ("bench_filter", ["--states", "1", "--controllers", "random"], ["Safety filter, d = 2"]),
+        ("bench_env_step", ["--no-memory", "--profile"], ["Whole step, d = 2", "Parts of a certified step"]),
+        ("bench_update", ["--envs", "4"], ["One update of all robots", "Collection and updates"]),
+    ],
+)
+def test_program(load, capsys, name, arguments, titles):
+    load(name).main([*TINY, *arguments])
+    out = capsys.readouterr().out
+    for title in titles:
+        assert f"### {title}" in out
+    assert "Traceback" not in out
+    rows = [line.split("|")[1:-1] for line in out.splitlines() if line.startswith("| ")]
+    assert all(any(character.isdigit() for character in "".join(row[3:])) for row in rows if row[0].strip().isdigit())
+
+
+def test_solvers_answer_the_same_problems(load):
+    """Solutions and gradients agree with the exact solver's, so the times are of the same work.
+
+    Only most of stock qpth's are right, and proxsuite's gradients are off by a hundredth whatever its tolerances.
+    """
+    bench = load("bench_qp")
+    found = bench.collect(load("harness").make_world(3), 12, ["robot", "ball"], "cpu")
+    reference = bench.Solver(found["robot"].head(12), "exact", 1)
+    value = reference.forward()
+    expected = [value, *reference.backward(value)]
+    assert bench.judge(reference.problems, reference.answer)[0] == 100
+    for name, (kind, build) in bench.contestants("robot", "cpu").items():
+        solver = build(found[kind].head(12), threads=1)
+        if kind == "ball" or len(solver.chain()) == 1:
+            continue
+        answer = solver.forward()
+        errors = [
+            (mine - theirs).abs().flatten(1).amax(1)
+            for mine, theirs in zip(expected, [answer, *solver.backward(answer)], strict=True)
+        ]
+        if name == bench.PROX:
+            assert errors[0].max() < 1e-3
+            assert errors[1].max() < 0.1
+        else:
+            assert all((e.median() if name == bench.STOCK else e.max()) < 1e-4 for e in errors), name
+
+
+def test_what_the_budget_does_not_allow_is_a_dash_with_its_reason(load, capsys):
+    load("bench_filter").main([*TINY, "--filters", "certified", "--controllers", "random", "--seconds", "0"])
+    assert "expected to take more than 0 s" not in capsys.readouterr().out  # a first, smallest size is always run
+    harness = load("harness")
+    budget = harness.Budget(harness.make_parser(None, batches="1", robots="1").parse_args(["--seconds", "1"]))
+    budget.seen["slow", 3] = (64, 0.5)
+    assert budget.medians({"slow": (lambda: None,)}, 512, 3) == {"slow": None}
+    assert "more than 1 s" in budget.footnote()
+    assert "slow" in budget.footnote()

@@ -1,0 +1,67 @@
+"""compile=true: the same results to rounding, the same promise, and no reason to fail."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+
+import envs.compilation
+from agents import make_controller
+from envs import SurveillanceConfig, SurveillanceEnv, keys
+from envs.compilation import compiled
+from safety import SafetyConfig, SafetyFilter
+
+
+def roll_out(world, steps=15, **options):
+    env = SurveillanceEnv(world, 24, seed=3, **options)
+    policy = TensorDictSequential(make_controller("gather", world), SafetyFilter(SafetyConfig(), world, **options))
+    return env.rollout(steps, policy, break_when_any_done=False)
+
+
+@pytest.fixture
+def world():
+    return SurveillanceConfig(dtype="float64", resolution=3)
+
+
+def test_compiled_roll_out_is_the_same_to_rounding(world):
+    plain, fast = roll_out(world), roll_out(world, compile=True)
+    for key in (keys.POSITION, keys.ENERGY, keys.ACTION, keys.CHARGE_CURRENT, keys.REWARD):
+        where = ("next", *key) if key == keys.REWARD else key
+        torch.testing.assert_close(fast[where], plain[where], rtol=0, atol=1e-9)
+    for kind in keys.VIOLATION_KINDS:
+        assert not fast[("next", *keys.VIOLATION, kind)].any()
+    assert not fast[keys.OUTSIDE].any()
+
+
+def test_violations_are_counted_when_compiled(world):
+    env = SurveillanceEnv(world, 24, compile=True)
+    td, seen = env.reset(), 0
+    for _ in range(40):  # everybody to one point, unfiltered
+        td[keys.ACTION] = -0.2 * torch.nn.functional.normalize(td[keys.POSITION], dim=-1)
+        td = env.step(td)["next"]
+        seen += td[(*keys.VIOLATION, "collision")].sum()
+    assert seen > 0
+
+
+def test_without_a_compiler_a_warning_and_the_same_results(world, monkeypatch):
+    plain = roll_out(world)
+    envs.compilation._works.cache_clear()
+
+    def broken(function, **_):
+        def call(*_):
+            raise RuntimeError("no working C++ compiler\nmore lines")
+
+        return call
+
+    monkeypatch.setattr(envs.compilation, "torch", SimpleNamespace(compile=broken, zeros=torch.zeros))
+    with pytest.warns(UserWarning, match="compile=true has no effect.*no working C") as seen:
+        without = roll_out(world, compile=True)
+    envs.compilation._works.cache_clear()
+    assert len([warning for warning in seen if "compile=true" in str(warning.message)]) == 1
+    assert torch.equal(without[keys.POSITION], plain[keys.POSITION])
+
+
+def test_off_means_untouched():
+    function = torch.sin
+    assert compiled(function, enabled=False) is function
