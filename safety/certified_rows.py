@@ -171,19 +171,23 @@ def _own_rows(
     Returns:
         Normals ``(K, R, d)`` and bounds ``(K, R)``, m/s; R is the largest number of rows that a robot needs.
     """
-    world, others = (robots // n).unsqueeze(-1), max(n - 1, 1)
+    world, others = robots // n, max(n - 1, 1)
     pair, side = (x[robots % n] for x in own_pairs(n, robots.device))  # (K, N - 1)
-    half = slack[:, world, pair].clamp_min(0).movedim(0, 1).flatten(1) / 2  # (K, (1 + S) (N - 1))
-    # the normals are no longer than 1, so such a row holds for every action
-    idle = half >= max_speed + length(anchor).unsqueeze(-1)
-    count = int((~idle).sum(-1).max()) if half.numel() else 0
-    half, entry = half.topk(count, dim=-1, largest=False)
+    half = slack[:, world.unsqueeze(-1), pair].clamp_min(0).movedim(0, 1).flatten(1) / 2  # (K, (1 + S) (N - 1))
+    # the normals are no longer than 1, so any other row holds for every action
+    needed = ~(half >= max_speed + length(anchor).unsqueeze(-1))
+    robot, entry = needed.nonzero(as_tuple=True)  # (E,)
+    place = needed.cumsum(dim=1)[robot, entry] - 1
+    count = int(place.max()) + 1 if len(place) else 0
     piece, other = entry // others, entry % others
-    own, second = pair.gather(1, other), side.gather(1, other)  # (K, R)
-    relative, distance = components_first(pieces.relative[piece, :, world, own]), pieces.distance[piece, world, own]
+    where = (world[robot], pair[robot, other])
     offset = position - slot_position
-    share, slope = way_to_go(length(offset).unsqueeze(-1), pieces.time[piece, world, own], geometry)
-    e, normal = from_slot(position, slot_position).unsqueeze(1), relative / distance.clamp_min(TINY).unsqueeze(-1)
+    share, slope = way_to_go(length(offset)[robot], pieces.time[(piece, *where)], geometry)
+    relative, distance = components_first(pieces.relative[piece, :, *where]), pieces.distance[(piece, *where)]
+    e, normal = from_slot(position, slot_position)[robot], relative / distance.clamp_min(TINY).unsqueeze(-1)
     gradient = share.unsqueeze(-1) * normal + ((slope - share) * dot(e, normal)).unsqueeze(-1) * e
-    normals = torch.where((second == 0).unsqueeze(-1), -gradient, gradient)
-    return normals, half + dot(normals, anchor.unsqueeze(1))
+    own = torch.where((side[robot, other] == 0).unsqueeze(-1), -gradient, gradient)
+    normals = position.new_zeros(len(robots), count, position.shape[-1])
+    bounds = position.new_full((len(robots), count), torch.inf)
+    normals[robot, place], bounds[robot, place] = own, half[robot, entry] + dot(own, anchor[robot])
+    return normals, bounds

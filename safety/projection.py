@@ -79,17 +79,24 @@ def _lines(g: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def nearest_on_one_row(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> tuple[Nearest, Tensor]:
-    """Nearest point of the half-space that ``t`` violates most, and whether it solves the whole problem ``(B,)``.
+    """Nearest point to ``t`` on the row that it violates most, in the ball, and whether it solves the whole problem.
 
-    Arguments as :func:`nearest_on_lines`. Most filter problems need no more: one robot, one row.
+    Most filter problems need no more: one robot, one row, and the speed limit. Arguments as :func:`nearest_on_lines`.
     """
     worst, row = (dot(G, t.unsqueeze(1)) - h).max(-1, keepdim=True)
     normal = G.gather(1, row.unsqueeze(-1).expand(-1, -1, G.shape[-1])).squeeze(1)
-    u = t - worst * normal
-    done = (worst.squeeze(-1) > 0) & ((dot(G, u.unsqueeze(1)) - h).amax(-1) <= ROUND * length(u))
+    bound, c = h.gather(1, row), torch.ones_like(worst)
+    flat = t - (worst + bound) * normal
     if radius is not None:
-        done = done & (length(u) <= radius)
-    return Nearest(u, torch.zeros_like(h).scatter(1, row, worst), torch.ones_like(worst).squeeze(-1)), done
+        half = ((radius - bound) * (radius + bound)).clamp_min((SLACK * radius) ** 2).sqrt()
+        c = (length(flat).unsqueeze(-1) / half).clamp_min(1.0)
+    u, force = bound * normal + flat / c, worst + (1 - c) * bound
+    size = length(u)
+    done = (worst > 0).squeeze(-1) & (force >= 0).squeeze(-1)
+    done = done & ((dot(G, u.unsqueeze(1)) - h).amax(-1) <= ROUND * size)
+    if radius is not None:
+        done = done & (size <= radius * (1 + ROUND))
+    return Nearest(u, torch.zeros_like(h).scatter(1, row, force), c.squeeze(-1)), done
 
 
 def nearest_on_lines(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Nearest:

@@ -32,7 +32,7 @@ STEPS = 4  # per timed run
 VMAS, UNFILTERED = "VMAS simple_spread", "unfiltered"
 OURS = {UNFILTERED: "none", "stacked": "stacked", "certified": "certified"}
 COMPILED = ", compiled"
-CAN_COMPILE = all("compile" in inspect.signature(cls).parameters for cls in (SurveillanceEnv, SafetyFilter))
+CAN_COMPILE = all("compile" in inspect.signature(cls.__init__).parameters for cls in (SurveillanceEnv, SafetyFilter))
 
 PARTS = {
     "filter: rows": ["safety.filter.certified_rows", "safety.filter.sampled_energy_row"],

@@ -79,13 +79,14 @@ def main() -> None:
             f"{summed('violations', kind):.0f}" for kind in ("depleted", "stranded", "overcharged", "collision")
         ]
         homing = share("homing_rate")
-        energy = min(c["min_energy_margin"] for c in contents)
+        energies = [c["min_energy_margin"] for c in contents]
+        energy = "NaN" if None in energies else f"{min(energies):.5f}"  # an unfiltered NaN action drains the battery to NaN
         distances = [c["min_distance_margin"] for c in contents if c["min_distance_margin"] is not None]
         points, patrolled = summed("task", "waypoints"), sum(c["robot_steps"] for c in contents if c["task"])
         cells = (
             *(key[0], str(key[1]), key[2], key[3], f"{count:,}", *violations),
             *(f"{summed('filter', 'infeasible'):.0f}", f"{summed('filter', 'outside'):.0f}"),
-            *(f"{share('fallback_rate') - homing:.3f}", f"{homing:.4f}", f"{energy:.5f}"),
+            *(f"{share('fallback_rate') - homing:.3f}", f"{homing:.4f}", energy),
             *(f"{min(distances):.4f}" if distances else "–", f"{1000 * points / patrolled:.1f}" if patrolled else "–"),
         )
         lines.append("| " + " | ".join(cells) + " |")
