@@ -1,6 +1,5 @@
 """Optional torch.compile of pure tensor functions: same results to rounding, and never a reason to fail."""
 
-import functools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -9,33 +8,41 @@ import torch
 from torch import Tensor
 
 
-def compiled(function: Callable[..., Any], *, enabled: bool) -> Callable[..., Any]:
-    """``torch.compile(function)`` if ``enabled``; where that does not work, the function itself, after one warning.
+class Compiled:
+    """A pure function of tensors, compiled at its first call; where that fails, the function itself, after one warning.
 
     Args:
-        function: pure: tensors in, tensors out.
-        enabled: whether compilation is asked for.
-
-    Returns:
-        A function of the same tensors, as positional arguments, with the same results to rounding.
+        function: tensors in, as positional arguments, tensors out.
     """
-    if not enabled:
-        return function
-    fast = torch.compile(function, dynamic=True)  # the shield's rounds are of any size
 
-    def call(*tensors: Tensor) -> Any:
-        return (fast if _works(tensors[0].device.type) else function)(*tensors)
+    warned = False
 
-    return call
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self.fast: Callable[..., Any] | None = torch.compile(
+            function, dynamic=True
+        )  # the shield's rounds are of any size
+
+    def __reduce__(self) -> tuple[type, tuple]:
+        """Copies and pickles compile anew."""
+        return Compiled, (self.function,)
+
+    def __call__(self, *tensors: Tensor) -> Any:
+        """The function's result, to rounding."""
+        if self.fast is not None:
+            try:
+                return self.fast(*tensors)
+            except Exception as error:  # a missing C++ compiler, header or Triton has an error type of its own each
+                self.fast = None
+                if not Compiled.warned:
+                    reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+                    warnings.warn(
+                        f"compile=true has no effect, torch.compile does not work here: {reason}", stacklevel=2
+                    )
+                    Compiled.warned = True
+        return self.function(*tensors)
 
 
-@functools.lru_cache(maxsize=8)
-def _works(device: str) -> bool:
-    """Whether torch.compile works here: tried once, on a tiny function."""
-    try:
-        torch.compile(lambda x: x + 1)(torch.zeros(2, device=device))
-    except Exception as error:  # a missing C++ compiler, header or Triton has an error type of its own each
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        warnings.warn(f"compile=true has no effect, torch.compile does not work on {device}: {reason}", stacklevel=3)
-        return False
-    return True
+def compiled(function: Callable[..., Any], *, enabled: bool) -> Callable[..., Any]:
+    """``function``, or its :class:`Compiled` form if ``enabled``."""
+    return Compiled(function) if enabled else function

@@ -19,7 +19,7 @@ def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
         ``(*B, N, d)``, m/s, norm at most ``max_speed`` (to a rounding: where it is the limit, another order of
         summation may find the next number).
     """
-    speed = dot(velocity, velocity).clamp_min(TINY_SQUARE).sqrt().unsqueeze(-1)  # a gradient of 0 at rest, not NaN
+    speed = length(velocity).unsqueeze(-1)
     # Cut to a hair below the limit: rounding must not lift a norm above it, and a velocity cut once is not cut again.
     return torch.where(speed > max_speed, velocity * (max_speed * (1 - 1e-6) / speed), velocity)
 
@@ -44,6 +44,7 @@ def other_indices(n_agents: int, device: torch.device | None = None) -> Tensor:
     return (robots.unsqueeze(-1) + robots[1:]) % n_agents
 
 
+@functools.lru_cache(maxsize=64)
 def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
@@ -76,8 +77,8 @@ def batch_last(x: Tensor) -> Tensor:
 
 
 def length(x: Tensor) -> Tensor:
-    """Norm over a short last dimension, as :func:`dot`; its gradient at 0 is NaN: for what is not differentiated."""
-    return dot(x, x).sqrt()
+    """Norm over a short last dimension, as :func:`dot`; 0 is 3e-19, where its gradient is 0."""
+    return dot(x, x).clamp_min(TINY_SQUARE).sqrt()
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:

@@ -203,11 +203,10 @@ def _relative_path(position: Tensor, slot_position: Tensor, geometry: HomingGeom
     first, last = torch.minimum(n_i, n_j), torch.maximum(n_i, n_j)
     times = torch.stack([torch.zeros_like(first), first, first + 1, torch.maximum(last, first + 1), last + 1])
     slots = slot_position.movedim(-1, 0)
-    corners = slots[..., i] - slots[..., j]
-    corners = torch.addcmul(corners, direction[..., i], _to_go(distance[..., i], n_i, times, geometry).unsqueeze(1))
-    return times, torch.addcmul(
-        corners, direction[..., j], _to_go(distance[..., j], n_j, times, geometry).unsqueeze(1), value=-1
-    )
+    way_i = direction[..., i] * _to_go(distance[..., i], n_i, times, geometry).unsqueeze(1)
+    way_j = direction[..., j] * _to_go(distance[..., j], n_j, times, geometry).unsqueeze(1)
+    # in this order and with no fused product, two robots that mirror each other keep an offset of exactly 0
+    return times, (slots[..., i] - slots[..., j]) + (way_i - way_j)
 
 
 def _to_go(distance: Tensor, whole: Tensor, times: Tensor, geometry: HomingGeometry) -> Tensor:

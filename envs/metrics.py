@@ -3,6 +3,8 @@
 All comparisons are written so that NaN counts as a violation.
 """
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -32,7 +34,7 @@ def violations(
     way = _length(next_position.unsqueeze(-2) - slots).amin(dim=-1)
     needed = config.drain_rate * (way - config.break_even_radius).clamp_min(0) / config.max_speed
     close = ~(_step_gap(position, next_position) >= config.safety_distance)
-    i, j = _pairs(position)
+    i, j = _pairs(position.shape[-2], position.device)
     collision = torch.zeros_like(next_energy, dtype=torch.int64)
     collision = collision.index_add(-1, i, close.to(torch.int64)).index_add(-1, j, close.to(torch.int64))
     flags = (
@@ -44,8 +46,9 @@ def violations(
     return dict(zip(VIOLATION_KINDS, flags, strict=True))
 
 
-def _pairs(position: Tensor) -> tuple[Tensor, Tensor]:
-    i, j = torch.triu_indices(position.shape[-2], position.shape[-2], offset=1, device=position.device)
+@functools.lru_cache(maxsize=64)
+def _pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j
 
 
@@ -56,7 +59,7 @@ def _length(x: Tensor) -> Tensor:
 
 def _step_gap(position: Tensor, next_position: Tensor) -> Tensor:
     """Least distance of every pair of robots over the step, ``(*B, P)``: closest point of the relative segment to 0."""
-    i, j = _pairs(position)
+    i, j = _pairs(position.shape[-2], position.device)
     start = position[..., i, :] - position[..., j, :]
     move = next_position[..., i, :] - next_position[..., j, :] - start
     long = move.square().sum(-1)

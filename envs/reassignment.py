@@ -68,7 +68,8 @@ def reassign_slots(
     Returns:
         ``(*B, N)`` int64, one-to-one.
     """
-    flat = position.flatten(0, -3), energy.flatten(0, -2), slot.flatten(0, -2)
+    n, d = position.shape[-2:]
+    flat = position.reshape(-1, n, d), energy.reshape(-1, n), slot.reshape(-1, n)
     index = _may_exchange(flat[0], flat[2], slots).nonzero().squeeze(-1)
     some_position, some_energy, some_slot = (x[index] for x in flat)
     count = min(EXCHANGES, slot.shape[-1] * len(slots))

@@ -114,7 +114,7 @@ def anchors(
         Anchor ``(M, N, d)`` m/s and the slack it leaves ``(K, E)``.
     """
     world, i, j = members
-    home = homing_velocity(position, slot_position, geometry)
+    home = limit_speed(homing_velocity(position, slot_position, geometry), max_speed)
     size = length(chord_normal).clamp_min(TINY)
     critical = chord_bound < 0
     # a hair more than the least speed, as the row is met with equality; only limited where C has been left
@@ -164,7 +164,7 @@ def shield(
     whose certificate fails the robot with the lower level is, both if they are equal. Levels only rise, so the loop
     ends within ``2 N + 1`` rounds; from a certified state with every robot driving home all certificates hold, so it
     ends with all of them true. ``G`` changes by no more than the two robots move (it is 1-Lipschitz in each position),
-    so pairs with ``G >= Delta_G + 2 max_speed dt`` need not be looked at.
+    so pairs with ``G >= Delta_G + eps + 2 max_speed dt`` need not be looked at.
 
     Args:
         step: the environment's own transition, ``(position, energy, velocity, current) -> (position, energy)``.

@@ -1,4 +1,4 @@
-"""What both solvers share: the status and raw result of a solve, row scaling, the KKT residual, independent subsets of rows.
+"""What the solvers share: the status and raw result of a solve, row scaling, the KKT residual, independent subsets of rows.
 
 Conventions: flat batch B, float64; rows are normalised to unit norm (`normalise_rows`); a row that can never bind is
 g = 0, h = 1.

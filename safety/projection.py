@@ -33,7 +33,7 @@ ROUND = 1e-14
 """Violation, relative to the length, up to which the foot on one row satisfies the others."""
 
 
-class Nearest(NamedTuple):
+class Projected(NamedTuple):
     """Best candidate of every sample and its multipliers.
 
     Attributes:
@@ -78,7 +78,7 @@ def _lines(g: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return e, foot / size, exists, pairs
 
 
-def nearest_on_one_row(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> tuple[Nearest, Tensor]:
+def nearest_on_one_row(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> tuple[Projected, Tensor]:
     """Nearest point to ``t`` on the row that it violates most, in the ball, and whether it solves the whole problem.
 
     Most filter problems need no more: one robot, one row, and the speed limit. Arguments as :func:`nearest_on_lines`.
@@ -96,10 +96,10 @@ def nearest_on_one_row(t: Tensor, G: Tensor, h: Tensor, radius: float | None) ->
     done = done & ((dot(G, u.unsqueeze(1)) - h).amax(-1) <= ROUND * size)
     if radius is not None:
         done = done & (size <= radius * (1 + ROUND))
-    return Nearest(u, torch.zeros_like(h).scatter(1, row, force), c.squeeze(-1)), done
+    return Projected(u, torch.zeros_like(h).scatter(1, row, force), c.squeeze(-1)), done
 
 
-def nearest_on_lines(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Nearest:
+def nearest_on_lines(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projected:
     """Nearest feasible point to ``t`` among the candidates of the module docstring.
 
     Args:
@@ -163,7 +163,7 @@ def nearest_on_lines(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> N
     if n == 3:
         best, _ = _choose(best, cost, target, *_in_planes(target, g, h, radius), g, h)
     u, lam, c = best
-    return Nearest(u[:, 0].mT, lam.mT, c[0])
+    return Projected(u[:, 0].mT, lam.mT, c[0])
 
 
 def _add_set(lam: Tensor, pull: Tensor, g: Tensor, sets: Tensor) -> Tensor:

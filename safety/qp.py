@@ -10,7 +10,8 @@ makes the sample INFEASIBLE otherwise. Every tensor may have any batch shape; th
 
 Four solvers, the same guarantees:
 
-* "exact", n ≤ 3: enumeration of active sets (safety/qp_exact.py); `project_halfspaces_ball` is its hot path.
+* "exact", n ≤ 3 (safety/qp_exact.py): closed forms for the projection (`project_halfspaces_ball`, its hot path), enumeration
+  of active sets otherwise.
 * "active_set", any n: dual active-set method (safety/qp_active_set.py), for the joint problems of many robots.
 * "pdipm", any n: interior-point method with n x n systems (safety/qp_pdipm.py), then the active set of the rows near its
   solution. Slower, but its steps hardly grow with the number of active rows.
@@ -68,8 +69,8 @@ class QPSolution(NamedTuple):
         dual: (*B, m) multipliers of G u ≤ h, ≥ 0.
         status: (*B,) int64, a `QPStatus`.
         residual: (*B,) relative KKT residual.
-        iterations: (*B,) int64; "exact": active-set sizes enumerated (0: the unconstrained minimiser was feasible), or
-            steps of the ball multiplier search; "active_set" and "pdipm": iterations (0: the same); "qpth":
+        iterations: (*B,) int64; "exact": 0 where the unconstrained minimiser was feasible, 1 for a closed form, 1 + the
+            active-set sizes enumerated, or steps of the ball multiplier search; "active_set" and "pdipm": iterations (0: the same); "qpth":
             interior-point solves, as qpth does not tell its iterations.
     """
 

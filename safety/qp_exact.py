@@ -20,7 +20,7 @@ from torch import Tensor
 from envs.dynamics import batch_last, dot
 from safety.enumeration import CHUNK_BYTES, enumerate_projection, enumerate_reachable
 from safety.kkt import TINY, QPStatus, Raw, kkt_residual, norm, normalise_rows, pivoted_basis
-from safety.projection import Nearest, nearest_on_lines, nearest_on_one_row
+from safety.projection import Projected, nearest_on_lines, nearest_on_one_row
 
 FAST_TOL = 1e-11
 """KKT residual (relative) up to which the solution of the short way stands; above it the sample is enumerated."""
@@ -74,7 +74,7 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
     return raw
 
 
-def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Nearest:
+def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projected:
     """:func:`nearest_on_lines`, in chunks and without the rows that lie beyond the ball everywhere: they cannot bind."""
     (B, width, n), all_rows = G.shape, None
     m = width
@@ -85,7 +85,7 @@ def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Nearest:
             G, h, m = G.gather(1, all_rows[..., None].expand(-1, -1, n)), h.gather(1, all_rows), most
     step = max(1, CHUNK_BYTES // (8 * m ** max(n, 2) * 8))
     parts = [nearest_on_lines(*part, radius) for part in zip(t.split(step), G.split(step), h.split(step), strict=True)]
-    found = parts[0] if len(parts) == 1 else Nearest(*(torch.cat(x) for x in zip(*parts, strict=True)))
+    found = parts[0] if len(parts) == 1 else Projected(*(torch.cat(x) for x in zip(*parts, strict=True)))
     if all_rows is None:
         return found
     return found._replace(lam=found.lam.new_zeros(B, width).scatter(1, all_rows, found.lam))

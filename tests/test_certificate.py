@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from envs import SurveillanceConfig, SurveillanceEnv
-from envs.homing import certified_parts, closest_approach, closest_moments, homing_velocity, reserve
+from envs.homing import certified_parts, closest_approach, closest_moments, closest_pieces, homing_velocity, reserve
 from envs.transition import transition
 from safety.barriers import sampled_energy_row
 from safety.certificate import anchors, closest_approach_gradient, outside, pair_minimum, shield
@@ -120,6 +120,17 @@ def test_gradient_in_the_slot_is_the_limit_from_all_sides(family, d):
     assert (there[apart][share[apart] == 0] == 0).all()  # home by then: no influence
     assert torch.equal(share == 1, there.norm(dim=-1)[:, 0] > 1 - 1e-9)
     assert min((share == 0).sum(), (share == 1).sum()) > 20
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_mirrored_robots_keep_an_offset_of_exactly_zero(dtype):
+    """A rounding in the relative path would tilt the rows of a robot between two others, and pin it."""
+    g = make_world(dimension=2).homing
+    position, slot = (x[:, :1].to(dtype) for x in scattered(2000, 1, 2, seed=5))
+    mirror = torch.tensor([-1.0, 1.0], dtype=dtype)
+    pieces = closest_pieces(torch.cat([position, mirror * position], 1), torch.cat([slot, mirror * slot], 1), g)
+    assert (pieces.relative[:, 1] == 0).all()
+    assert (pieces.relative[:, 0] != 0).any()
 
 
 # ---- lemmas -------------------------------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """compile=true: the same results to rounding, the same promise, and no reason to fail."""
 
+import copy
+import pickle
 from types import SimpleNamespace
 
 import pytest
@@ -46,7 +48,7 @@ def test_violations_are_counted_when_compiled(world):
 
 def test_without_a_compiler_a_warning_and_the_same_results(world, monkeypatch):
     plain = roll_out(world)
-    envs.compilation._works.cache_clear()
+    monkeypatch.setattr(envs.compilation.Compiled, "warned", False)
 
     def broken(function, **_):
         def call(*_):
@@ -54,12 +56,16 @@ def test_without_a_compiler_a_warning_and_the_same_results(world, monkeypatch):
 
         return call
 
-    monkeypatch.setattr(envs.compilation, "torch", SimpleNamespace(compile=broken, zeros=torch.zeros))
+    monkeypatch.setattr(envs.compilation, "torch", SimpleNamespace(compile=broken))
     with pytest.warns(UserWarning, match="compile=true has no effect.*no working C") as seen:
         without = roll_out(world, compile=True)
-    envs.compilation._works.cache_clear()
     assert len([warning for warning in seen if "compile=true" in str(warning.message)]) == 1
     assert torch.equal(without[keys.POSITION], plain[keys.POSITION])
+
+
+def test_a_compiled_function_survives_a_copy():
+    function = pickle.loads(pickle.dumps(compiled(torch.sin, enabled=True)))
+    torch.testing.assert_close(copy.deepcopy(function)(torch.ones(3)), torch.ones(3).sin())
 
 
 def test_off_means_untouched():

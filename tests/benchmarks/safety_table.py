@@ -80,7 +80,9 @@ def main() -> None:
         ]
         homing = share("homing_rate")
         energies = [c["min_energy_margin"] for c in contents]
-        energy = "NaN" if None in energies else f"{min(energies):.5f}"  # an unfiltered NaN action drains the battery to NaN
+        energy = (
+            "NaN" if None in energies else f"{min(energies):.5f}"
+        )  # an unfiltered NaN action drains the battery to NaN
         distances = [c["min_distance_margin"] for c in contents if c["min_distance_margin"] is not None]
         points, patrolled = summed("task", "waypoints"), sum(c["robot_steps"] for c in contents if c["task"])
         cells = (
