@@ -243,7 +243,7 @@ def differentiate(
     dp, dG, dh = -grad, None, None
     if rows_too:
         dG, dh = torch.zeros_like(G), torch.zeros_like(G[..., 0])
-    dQ = None if Q is None else torch.zeros_like(Q)
+    whole = u
     # Where nothing binds the gradient of a projection is the identity, exactly.
     index = (solved & ((lam > 0).any(-1) | (mu > 0)) if identity else solved).nonzero()[:, 0]
     if len(index):
@@ -276,7 +276,7 @@ def differentiate(
             change = lam[sample, row, None] * dz[sample] + dlam[sample, slot, None] * u[sample]
             dG[index[sample], row] = change.to(dG.dtype)
             dh[index[sample], row] = -dlam[sample, slot].to(dh.dtype)
-        if dQ is not None:
-            outer = dz[..., None] * u[:, None]
-            dQ[index] = ((outer + outer.mT) / 2).to(dQ.dtype)
-    return dQ, dp, dG, dh
+    if Q is None:
+        return None, dp, dG, dh
+    outer = dp[..., None] * whole[:, None].to(dp.dtype)
+    return (outer + outer.mT) / 2, dp, dG, dh

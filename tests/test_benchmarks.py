@@ -72,3 +72,13 @@ def test_what_the_budget_does_not_allow_is_a_dash_with_its_reason(load, capsys):
     assert budget.medians({"slow": (lambda: None,)}, 512, 3) == {"slow": None}
     assert "more than 1 s" in budget.footnote()
     assert "slow" in budget.footnote()
+
+
+def test_accuracy_program(load, capsys):
+    """Every category once per solver; the status says that Clarabel and the differences agree."""
+    status = load("qp_accuracy").main(["--problems", "15", "--solvers", "exact,active_set"])
+    out = capsys.readouterr().out
+    assert status == 0, out
+    rows = [line.split("|")[1:-1] for line in out.splitlines() if line.startswith("| ")]
+    assert sum(row[0].strip() == "1" for row in rows) == 30
+    assert sum(row[0].strip() == "15" for row in rows) == 2

@@ -419,3 +419,11 @@ def test_no_gradient_without_a_solution(solver):
     grads = gradients((Q, p, G, h), torch.ones_like(p), solver)
     assert all((x[1:] == 0).all() for x in grads)
     assert grads[1][0].any()
+
+
+@pytest.mark.parametrize("solver", ["exact", "active_set", "pdipm", "qpth"])
+def test_gradient_of_an_identity_matrix_where_nothing_binds(solver):
+    Q, p = torch.eye(2, dtype=torch.float64, requires_grad=True), torch.tensor([1.0, 2.0], dtype=torch.float64)
+    G, h = torch.tensor([[1.0, 0.0]], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)
+    solve_qp(Q, p, G, h, solver=solver).value.sum().backward()
+    torch.testing.assert_close(Q.grad, torch.tensor([[1.0, 1.5], [1.5, 2.0]], dtype=torch.float64))

@@ -8,10 +8,10 @@ category, solver and dtype, over as many problems in all as --problems says:
 * error: worst ‖u - u'‖ to Clarabel's u' over max(‖u'‖, 1e-3 ‖unconstrained u‖), the length of the KKT residual.
 * KKT: worst relative KKT residual of what is SOLVED. For float64 the larger of the reported one and one computed from value
   and dual over all rows; for float32 the reported one, of the solution before it is rounded.
-* SOLVED: share; infeasible: reported of constructed (or found by Clarabel, too); NaN: problems with a NaN or inf in an output.
-* unsure: Clarabel's own residual is above 1e-12 and above the solver's, or it gives up. Then the values are not compared;
-  instead the solver's must satisfy the rows and its objective must not be above Clarabel's. Float32 data may be among them
-  that the rounding has made infeasible, by less than what counts as SOLVED.
+* SOLVED: share; infeasible: reported of constructed (or refuted by Clarabel or a linear program, too: float32 data that the
+  rounding has made infeasible); NaN: problems with a NaN or inf in an output.
+* unsure: Clarabel's own residual is above 1e-12 and above the solver's, or above 1e-10. Then the values are not compared;
+  instead the solver's must satisfy the rows and its objective must not be above Clarabel's.
 
 Clarabel is taken as the reference after Newton steps from its solution and multipliers, as its tolerances leave a solution
 uncertain by their square root. Rows nearly parallel, a third each: as they come, the solution where two of them cross, and
@@ -22,9 +22,10 @@ The second table is on gradients: each solver's against central differences, the
 at a time.
 
 The status is 1, and an example is printed, if a SOLVED value differs from a sure Clarabel's by more than 1e-6 + 10 κ r (r the
-KKT residual, κ the condition of the rows at the solution and of Q), or fails the checks where Clarabel is unsure; if an
-infeasible problem is not called so (by qpth: is called SOLVED, as it proves only gross contradictions) or a feasible one is;
-if there is a NaN; or if gradients, or what is solved one by one, differ by more than 1e-6.
+KKT residual, κ the condition of the rows at the solution and of Q, times ‖unconstrained u‖ / ‖u‖), or fails the checks where
+Clarabel is unsure; if an infeasible problem is not called so (by qpth: is called SOLVED, as it proves only gross
+contradictions) or a feasible one is; if there is a NaN; or if gradients, or what is solved one by one, differ by more than
+1e-6.
 """
 
 import argparse
@@ -39,7 +40,7 @@ import clarabel
 import harness
 import numpy as np
 import torch
-from scipy import sparse
+from scipy import optimize, sparse
 from torch import Tensor
 
 from safety.kkt import SCALE_FLOOR, TINY, kkt_residual, norm, normalise_rows
@@ -49,7 +50,7 @@ from tests import test_qp, test_qp_joint
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 SOLVERS = ("exact", "active_set", "pdipm", "qpth")
 TOLERANCE = 1e-6  # of values (where KKT residual and condition are small) and of gradients, relative
-SURE = 1e-12  # KKT residual up to which Clarabel's value is compared, even if the solver's is smaller
+SURE, UNSURE = 1e-12, 1e-10  # KKT residuals at which Clarabel's value is, and is not, compared whatever the solver's
 FINE = 1e-14  # KKT residual at which it is not refined
 ATTEMPTS = ((1e-14, False), (1e-12, True), (1e-9, True))
 """Clarabel's tolerance, and whether each row is scaled by a power of two to size one; the next one where it is not sure."""
@@ -221,9 +222,8 @@ class Judge:
         self.problems = problems.double()
         self.Q, self.p, G, h, self.radius, _ = self.problems
         self.G, self.h, self.size, _ = normalise_rows(G, h)
-        self.free = norm(torch.linalg.solve(self.Q, self.p))
-        if self.radius is not None:
-            self.free = self.free.clamp(max=self.radius)
+        self.target = norm(torch.linalg.solve(self.Q, self.p))
+        self.free = self.target if self.radius is None else self.target.clamp(max=self.radius)
 
     def length(self, u: Tensor) -> Tensor:
         """The length that errors are relative to."""
@@ -289,11 +289,19 @@ class Judge:
         return best
 
     def condition(self, u: Tensor) -> Tensor:
-        """By how much a KKT residual may show in u: of the rows that u touches, and of Q."""
+        """By how much a KKT residual may show in u: of the rows that u touches, of Q, and of u to the unconstrained one."""
         touched = self.slack(u) <= 1e-5 * self.length(u)[:, None]
         size = torch.linalg.svdvals(torch.where(touched[..., None], self.G, 0.0))
         least = torch.where(size > 1e-12, size, 1.0).amin(-1)
-        return torch.linalg.cond(self.Q) / least
+        return torch.linalg.cond(self.Q) / least * (self.target / self.length(u)).clamp(min=1.0)
+
+    def contradict(self, i: int) -> bool:
+        """Whether the rows of problem i contradict each other, by a linear program for the least violation."""
+        G, h = self.G[i].numpy(), self.h[i].numpy()
+        rows, cost = np.c_[G, -np.ones(len(h))], np.r_[np.zeros(G.shape[1]), 1.0]
+        tolerances = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+        found = optimize.linprog(cost, A_ub=rows, b_ub=h, bounds=(None, None), options=tolerances)
+        return bool(found.status == 0 and found.fun > 1e-9)
 
     def clarabel(self) -> tuple[Judged, Tensor]:
         """Clarabel's solutions, refined, and which problems it calls infeasible."""
@@ -418,14 +426,16 @@ def compare(
     u, lam = solution.value.double(), torch.zeros_like(judge.h)
     lam[:, : solution.dual.shape[1]] = solution.dual.double()
     mine = judge(u, torch.where(judge.G.any(-1), lam * judge.size, 0.0))
+    residual = solution.residual.double()
     if dtype == torch.float64:
-        residual = torch.maximum(solution.residual, mine.residual)
-    else:
-        residual = solution.residual.double()
+        residual = torch.maximum(residual, mine.residual)
     status, impossible = solution.status, torch.full_like(refuted, judge.problems.infeasible)
     solved, reported = status == QPStatus.SOLVED, status == QPStatus.INFEASIBLE
+    refuted = refuted.clone()
+    for i in (reported & ~impossible & ~refuted).nonzero()[:, 0].tolist():
+        refuted[i] = judge.contradict(i)
     odd = ~(u.isfinite().all(-1) & solution.dual.isfinite().all(-1)) | solution.residual.isnan()
-    sure = theirs.residual <= residual.clamp(min=SURE)
+    sure = theirs.residual <= residual.clamp(SURE, UNSURE)
     unsure = torch.where(impossible, ~refuted, solved & ~sure)
     compared = solved & sure & ~impossible
     error = norm(u - theirs.u) / judge.length(theirs.u)
@@ -460,7 +470,7 @@ def compare(
 def solve(problems: Problems, solver: str) -> QPSolution:
     """By the projection where the problem is one in a ball."""
     Q, p, G, h, radius, _ = problems
-    if radius is not None and (Q == torch.eye(p.shape[-1], dtype=p.dtype)).all():
+    if radius is not None and (torch.eye(p.shape[-1], dtype=p.dtype) == Q).all():
         return project_halfspaces_ball(-p, G, h, radius)
     return solve_qp(Q, p, G, h, radius=radius, solver=solver)
 
