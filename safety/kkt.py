@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import length
+from envs.dynamics import dot
 
 
 class QPStatus(IntEnum):
@@ -62,7 +62,7 @@ class Raw(NamedTuple):
 
 def norm(x: Tensor) -> Tensor:
     """Euclidean norm over the last dimension; over two or three components torch's own is slow."""
-    return torch.linalg.vector_norm(x, dim=-1) if x.shape[-1] > 3 else length(x)
+    return torch.linalg.vector_norm(x, dim=-1) if x.shape[-1] > 3 else dot(x, x).sqrt()
 
 
 def column_norm(x: Tensor) -> Tensor:

@@ -23,7 +23,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, length
+from envs.dynamics import dot
+from safety.kkt import norm
 
 PARALLEL = 1e-11
 """Sine of the angle below which a row counts as parallel to a line."""
@@ -89,9 +90,9 @@ def nearest_on_one_row(t: Tensor, G: Tensor, h: Tensor, radius: float | None) ->
     flat = t - (worst + bound) * normal
     if radius is not None:
         half = ((radius - bound) * (radius + bound)).clamp_min((SLACK * radius) ** 2).sqrt()
-        c = (length(flat).unsqueeze(-1) / half).clamp_min(1.0)
+        c = (norm(flat).unsqueeze(-1) / half).clamp_min(1.0)
     u, force = bound * normal + flat / c, worst + (1 - c) * bound
-    size = length(u)
+    size = norm(u)
     done = (worst > 0).squeeze(-1) & (force >= 0).squeeze(-1)
     done = done & ((dot(G, u.unsqueeze(1)) - h).amax(-1) <= ROUND * size)
     if radius is not None:

@@ -69,9 +69,9 @@ class QPSolution(NamedTuple):
         dual: (*B, m) multipliers of G u ≤ h, ≥ 0.
         status: (*B,) int64, a `QPStatus`.
         residual: (*B,) relative KKT residual.
-        iterations: (*B,) int64; "exact": 0 where the unconstrained minimiser was feasible, 1 for a closed form, 1 + the
-            active-set sizes enumerated, or steps of the ball multiplier search; "active_set" and "pdipm": iterations (0: the same); "qpth":
-            interior-point solves, as qpth does not tell its iterations.
+        iterations: (*B,) int64; 0 where the unconstrained minimiser was feasible, else: "exact": 1 for a closed form,
+            1 + the active-set sizes enumerated, or steps of the ball multiplier search; "active_set" and "pdipm":
+            iterations; "qpth": interior-point solves, as qpth does not tell its iterations.
     """
 
     value: Tensor
