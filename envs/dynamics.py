@@ -77,7 +77,7 @@ def batch_last(x: Tensor) -> Tensor:
 
 
 def length(x: Tensor) -> Tensor:
-    """Norm over a short last dimension, as :func:`dot`; 0 is 3e-19, where its gradient is 0."""
+    """Norm over a short last dimension, as :func:`dot`; 0 is 3e-19, to divide by, and its gradient there 0."""
     return dot(x, x).clamp_min(TINY_SQUARE).sqrt()
 
 

@@ -92,7 +92,7 @@ def homing_velocity(position: Tensor, slot_position: Tensor, geometry: HomingGeo
     if geometry.family == "logarithmic":
         return geometry.gain * offset
     distance = length(offset).unsqueeze(-1)
-    return offset * torch.clamp(geometry.speed / distance.clamp_min(TINY), max=1 / geometry.dt)
+    return offset * torch.clamp(geometry.speed / distance, max=1 / geometry.dt)
 
 
 class ClosestPieces(NamedTuple):
@@ -155,7 +155,7 @@ def way_to_go(distance: Tensor, time: Tensor, geometry: HomingGeometry) -> tuple
     """Share of the way home that is left at ``time``, and its slope ``dl / dD``.
 
     Args:
-        distance: ``(...)``, distance to the own slot at the start, m.
+        distance: ``(...)``, distance to the own slot at the start, m, as :func:`envs.dynamics.length` gives it: not 0.
         time: ``(...)``, as in :class:`ClosestPieces`.
         geometry: constants of the backup motion.
 
@@ -167,16 +167,14 @@ def way_to_go(distance: Tensor, time: Tensor, geometry: HomingGeometry) -> tuple
         return share, share
     whole = (distance / (geometry.speed * geometry.dt)).floor()
     slope = torch.where(time <= whole, 1.0, (whole + 1 - time).clamp_min(0))
-    to_go = _to_go(distance, whole, time, geometry)
-    # in the slot the last step's ratio stands
-    return torch.where(distance > 0, to_go / distance.clamp_min(TINY), slope), slope
+    return _to_go(distance, whole, time, geometry) / distance, slope
 
 
 def closest_moments(position: Tensor, slot_position: Tensor, geometry: HomingGeometry) -> ClosestMoments:
     """:func:`closest_pieces` with both robots' way to go; arguments as :func:`closest_approach`."""
     pieces = closest_pieces(position, slot_position, geometry)
-    offset = position - slot_position
-    distance = torch.stack([length(offset)[..., x] for x in pair_indices(position.shape[-2], position.device)])
+    way = length(position - slot_position)
+    distance = torch.stack([way[..., x] for x in pair_indices(position.shape[-2], position.device)])
     share, slope = way_to_go(distance, pieces.time.unsqueeze(1), geometry)
     return ClosestMoments(pieces.distance, pieces.relative, share, slope)
 
@@ -197,7 +195,7 @@ def _relative_path(position: Tensor, slot_position: Tensor, geometry: HomingGeom
     i, j = pair_indices(position.shape[-2], position.device)
     offset = position - slot_position
     distance = length(offset)
-    direction = (offset / distance.clamp_min(TINY).unsqueeze(-1)).movedim(-1, 0)  # (d, *B, N)
+    direction = (offset / distance.unsqueeze(-1)).movedim(-1, 0)  # (d, *B, N)
     whole = (distance / (geometry.speed * geometry.dt)).floor()
     n_i, n_j = whole[..., i], whole[..., j]
     first, last = torch.minimum(n_i, n_j), torch.maximum(n_i, n_j)

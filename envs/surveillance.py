@@ -235,7 +235,7 @@ class SurveillanceEnv(EnvBase):
     def _watch(self, position: Tensor, params: Tensor, *, advance: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Density parameters, coverage cost ``(B, 1)`` and, if observed, centroids ``(B, N, d)`` of all worlds.
 
-        The Voronoi distances of a chunk of worlds at a time: their memory is bounded, and they stay in the cache.
+        The Voronoi distances of a chunk of worlds at a time, so that their memory is bounded.
         """
         density, parts = self.density, []
         size = max(1, CHUNK_DISTANCES // (position.shape[-2] * len(density.points)))

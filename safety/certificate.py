@@ -53,7 +53,8 @@ def closest_approach_gradient(
     moments = closest_moments(position, slot_position, geometry)
     least, index = moments.distance.min(dim=0, keepdim=True)
     pair = torch.stack(pair_indices(position.shape[-2], position.device))
-    e = from_slot(position, slot_position).movedim(-1, 0)[..., pair].movedim(-2, 0)  # (2, d, *B, P)
+    e, _ = from_slot(position, slot_position)
+    e = e.movedim(-1, 0)[..., pair].movedim(-2, 0)  # (2, d, *B, P)
     gradients = pair_gradients(moments, e)
     wide = index[:, None, None].expand(1, *gradients.shape[1:])
     first, second = gradients.gather(0, wide).squeeze(0).movedim(1, -1)
@@ -71,15 +72,21 @@ def pair_gradients(moments: ClosestMoments, e: Tensor) -> Tensor:
         ``(S, 2, d, ...)``.
     """
     normal = (moments.relative / moments.distance.clamp_min(TINY).unsqueeze(1)).unsqueeze(1)  # (S, 1, d, ...)
-    along = (moments.slope - moments.share) * (e * normal).sum(2)
-    gradient = moments.share.unsqueeze(2) * normal + along.unsqueeze(2) * e
+    gradient = own_gradient(moments.share, moments.slope, e, normal, 2)
     return torch.stack([gradient[:, 0], -gradient[:, 1]], dim=1)
 
 
-def from_slot(position: Tensor, slot_position: Tensor) -> Tensor:
-    """Directions ``e`` from the slots to the robots, 0 in the slot."""
+def own_gradient(share: Tensor, slope: Tensor, e: Tensor, normal: Tensor, dim: int) -> Tensor:
+    """``r n + (l' - r)(e . n) e``, components along ``dim`` of ``e`` and ``n``; r and l' have no such dimension."""
+    along = (slope - share) * (e * normal).sum(dim)
+    return share.unsqueeze(dim) * normal + along.unsqueeze(dim) * e
+
+
+def from_slot(position: Tensor, slot_position: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions ``e (*B, N, d)`` from the slots to the robots, 0 in the slot, and distances ``(*B, N)``, m."""
     offset = position - slot_position
-    return offset / length(offset).clamp_min(TINY).unsqueeze(-1)
+    distance = length(offset)
+    return offset / distance.unsqueeze(-1), distance
 
 
 def anchors(
@@ -115,7 +122,7 @@ def anchors(
     """
     world, i, j = members
     home = limit_speed(homing_velocity(position, slot_position, geometry), max_speed)
-    size = length(chord_normal).clamp_min(TINY)
+    size = length(chord_normal)
     critical = chord_bound < 0
     # a hair more than the least speed, as the row is met with equality; only limited where C has been left
     least = (-chord_bound / size * (1 + 1e-6)).clamp(0, max_speed)

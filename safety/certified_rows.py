@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import components_first, dot, length, own_pairs, pair_indices
+from envs.dynamics import dot, length, own_pairs, pair_indices
 from envs.homing import TINY, ClosestMoments, ClosestPieces, HomingGeometry, closest_pieces, way_to_go
-from safety.certificate import anchors, from_slot, pair_gradients
+from safety.certificate import anchors, from_slot, own_gradient, pair_gradients
 from safety.config import Gains
 
 HAIR = 1e-5
@@ -78,7 +78,7 @@ def certified_rows(
     spare = (later - geometry.clearance - geometry.eps_distance).clamp_min(0)
     # a class-K function that is flat at 0: what the linearisation of G misses near the limit is of second order too
     decrease = gains.certificate * spare.square() / (spare + step)
-    collision = gains.collision * (now.square() - safety_distance**2) / (2 * now).clamp_min(TINY)
+    collision = gains.collision * (now.square() - safety_distance**2) / (2 * now)
     slack = torch.cat([collision.unsqueeze(0), decrease])  # (K, M, P), m/s: row 0 is the present distance's
     # the collision row is the row of a piece on which nobody has moved yet
     present = (now, gap.movedim(-1, 0), torch.zeros_like(now))
@@ -90,9 +90,9 @@ def certified_rows(
         near = critical & (slack.amin(dim=0) < 6 * max_speed)
         world, pair = near.nonzero(as_tuple=True)
         members = (world, i[pair], j[pair])
-        e = from_slot(position, slot_position)
+        e, way = from_slot(position, slot_position)
         e = torch.stack([e[world, x].mT for x in members[1:]])  # (2, d, E)
-        way = torch.stack([length(position - slot_position)[world, x] for x in members[1:]])
+        way = torch.stack([way[world, x] for x in members[1:]])
         time = pieces.time[:, world, pair].unsqueeze(1)
         moments = ClosestMoments(
             pieces.distance[:, world, pair], pieces.relative[:, :, world, pair], *way_to_go(way, time, geometry)
@@ -181,11 +181,10 @@ def _own_rows(
     count = int(place.max()) + 1 if len(place) else 0
     piece, other = entry // others, entry % others
     where = (world[robot], pair[robot, other])
-    offset = position - slot_position
-    share, slope = way_to_go(length(offset)[robot], pieces.time[(piece, *where)], geometry)
-    relative, distance = components_first(pieces.relative[piece, :, *where]), pieces.distance[(piece, *where)]
-    e, normal = from_slot(position, slot_position)[robot], relative / distance.clamp_min(TINY).unsqueeze(-1)
-    gradient = share.unsqueeze(-1) * normal + ((slope - share) * dot(e, normal)).unsqueeze(-1) * e
+    e, way = from_slot(position, slot_position)
+    share, slope = way_to_go(way[robot], pieces.time[(piece, *where)], geometry)
+    normal = pieces.relative[piece, :, *where].mT / pieces.distance[(piece, *where)].clamp_min(TINY)  # (d, E)
+    gradient = own_gradient(share, slope, e[robot].mT, normal, 0).mT
     own = torch.where((side[robot, other] == 0).unsqueeze(-1), -gradient, gradient)
     normals = position.new_zeros(len(robots), count, position.shape[-1])
     bounds = position.new_full((len(robots), count), torch.inf)

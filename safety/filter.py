@@ -41,7 +41,7 @@ from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
 from safety.certified_rows import Rows, certified_rows
 from safety.config import SafetyConfig
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
-from safety.speed_faces import joint_rows, speed_faces
+from safety.speed_faces import face_normals, joint_rows
 
 
 class SafetyFilter(TensorDictModuleBase):
@@ -260,8 +260,7 @@ class SafetyFilter(TensorDictModuleBase):
         """One problem per robot: ``target (*B, d)``, ``G (*B, m, d)``, ``h (*B, m)``."""
         radius = self.world.max_speed
         if self.safety.solver not in ("auto", "exact"):
-            faces, offset = speed_faces(target.shape[-1], radius)
-            faces = torch.tensor(faces, dtype=target.dtype, device=target.device)
+            faces, offset = face_normals(target.shape[-1], radius, target.dtype, target.device)
             G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)
             h = torch.cat([h, h.new_full((*h.shape[:-1], len(faces)), offset)], dim=-1)
             identity = torch.eye(target.shape[-1], dtype=target.dtype, device=target.device)

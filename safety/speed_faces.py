@@ -32,6 +32,13 @@ def speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float
     return normals.tolist(), radius * math.cos(widest)
 
 
+@lru_cache(maxsize=64)
+def face_normals(dimension: int, radius: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
+    """:func:`speed_faces` with the normals as a tensor ``(F, d)``, made once."""
+    normals, offset = speed_faces(dimension, radius)
+    return torch.tensor(normals, dtype=dtype, device=device), offset
+
+
 def _spiral(n: int) -> Tensor:
     """``n`` nearly even directions in 3-D (golden spiral), ``(n, 3)``."""
     k = torch.arange(n, dtype=torch.float64)
@@ -64,8 +71,7 @@ def joint_rows(
     pair_rows[..., pairs, j, :] = gain_s[..., j, i, :]
     eye = torch.eye(n, dtype=gain_c.dtype, device=gain_c.device)
     own_rows = eye.unsqueeze(-1) * gain_c.unsqueeze(-2)
-    faces, offset = speed_faces(d, max_speed)
-    faces = torch.tensor(faces, dtype=gain_c.dtype, device=gain_c.device)
+    faces, offset = face_normals(d, max_speed, gain_c.dtype, gain_c.device)
     face_rows = torch.einsum("ij,fd->ifjd", eye, faces).flatten(0, 1).expand(*batch, -1, n, d)
     # a pair's row is asked for if either robot's composite is that pair
     bound_pair = torch.minimum(bound_s[..., i, j], bound_s[..., j, i])

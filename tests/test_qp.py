@@ -99,21 +99,26 @@ def assert_finite(solution):
 # ---------------------------------------------------------------------------------------------- known answers
 
 
+BINDING = [  # answers known by hand; the target violates a row
+    pytest.param([2, 3], [[1, 0], [0, 1]], [1, 1], [1, 1], [1, 2], id="corner"),
+    pytest.param([0, 0], [[1, 1]], [-2], [-1, -1], [1], id="origin-cut-off"),
+    pytest.param([2, 1], [[100, 0], [0, 1e-3]], [100, 2e-3], [1, 1], [0.01, 0], id="scaled-rows"),
+    pytest.param([2, 1], [[1, 0], [0, 1]], [1, math.inf], [1, 1], [1, 0], id="infinite-bound"),
+    pytest.param([2, 1], [[1, 0], [0, 0]], [1, 0], [1, 1], [1, 0], id="idle-zero-row"),
+    pytest.param([2, 1], [[1, 0], [-1, 0]], [1, -1], [1, 1], [1, 0], id="equality-pair"),
+]
+
+
 @BOTH
 @DTYPES
 @pytest.mark.parametrize(
     ("target", "G", "h", "value", "dual"),
     [
+        *BINDING,
         pytest.param([0.3, 0.4], [[1, 0]], [1], [0.3, 0.4], [0], id="unconstrained"),
         pytest.param([2, 1], [[1, 0]], [1], [1, 1], [1], id="one-row"),
-        pytest.param([2, 3], [[1, 0], [0, 1]], [1, 1], [1, 1], [1, 2], id="corner"),
         pytest.param([5, -5], [[1, 0], [-1, 0], [0, 1], [0, -1]], [1] * 4, [1, -1], [4, 0, 0, 4], id="box"),
-        pytest.param([0, 0], [[1, 1]], [-2], [-1, -1], [1], id="origin-cut-off"),
-        pytest.param([2, 1], [[100, 0], [0, 1e-3]], [100, 2e-3], [1, 1], [0.01, 0], id="scaled-rows"),
-        pytest.param([2, 1], [[1, 0], [0, 1]], [1, math.inf], [1, 1], [1, 0], id="infinite-bound"),
-        pytest.param([2, 1], [[1, 0], [0, 0]], [1, 0], [1, 1], [1, 0], id="idle-zero-row"),
         pytest.param([1, 1], [[1, 0]], [1], [1, 1], [0], id="weakly-active"),
-        pytest.param([2, 1], [[1, 0], [-1, 0]], [1, -1], [1, 1], [1, 0], id="equality-pair"),
         pytest.param([0, 0], [[1, 0], [0, 1], [1, 1]], [0, 0, 0], [0, 0], [0, 0, 0], id="origin-vertex"),
         pytest.param([2, 3], [[0, 0]], [math.inf], [2, 3], [0], id="nothing-binds"),
     ],
@@ -165,7 +170,7 @@ def test_ball_with_anisotropic_objective():
     torch.testing.assert_close(solution.value, tensor([0.6, 0.8]))
 
 
-@BOTH
+@pytest.mark.parametrize("solver", ["exact", "active_set", "pdipm", "qpth"])
 @DTYPES
 @pytest.mark.parametrize(
     ("G", "h"),

@@ -9,7 +9,7 @@ from safety import qp_pdipm
 from safety.kkt import kkt_residual, normalise_rows
 from safety.qp import KKT_TOL, QPStatus, solve_qp
 from safety.qp_joint import refutes
-from tests.test_qp import assert_finite, check_against_clarabel, tensor
+from tests.test_qp import BINDING, assert_finite, check_against_clarabel, tensor
 
 torch.set_num_threads(1)
 F64, F32 = torch.float64, torch.float32
@@ -155,12 +155,7 @@ def test_a_refutation_needs_evidence():
 @pytest.mark.parametrize(
     ("target", "G", "h", "value", "dual"),
     [
-        pytest.param([2, 3], [[1, 0], [0, 1]], [1, 1], [1, 1], [1, 2], id="corner"),
-        pytest.param([0, 0], [[1, 1]], [-2], [-1, -1], [1], id="origin-cut-off"),
-        pytest.param([2, 1], [[100, 0], [0, 1e-3]], [100, 2e-3], [1, 1], [0.01, 0], id="scaled-rows"),
-        pytest.param([2, 1], [[1, 0], [0, 1]], [1, math.inf], [1, 1], [1, 0], id="infinite-bound"),
-        pytest.param([2, 1], [[1, 0], [0, 0]], [1, 0], [1, 1], [1, 0], id="idle-zero-row"),
-        pytest.param([2, 1], [[1, 0], [-1, 0]], [1, -1], [1, 1], [1, 0], id="equality-pair"),
+        *BINDING,
         # the most violated row, the first, is dropped again: its multiplier would be negative
         pytest.param([4, 3], [[0.6, 0.8], [1, 0]], [1.5, 0], [0, 1.875], [1.40625, 3.15625], id="two-steps"),
         pytest.param([3, 2.5], [[0.8, 0.6], [1, 0]], [2.5, 0], [0, 2.5], [0, 3], id="drop"),
@@ -174,24 +169,6 @@ def test_known_answers(solver, dtype, target, G, h, value, dual):
     assert solution.iterations >= 1
     torch.testing.assert_close(solution.value, tensor(value, dtype=dtype), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(solution.dual, tensor(dual, dtype=dtype), rtol=1e-6, atol=1e-6)
-
-
-@BOTH
-@DTYPES
-@pytest.mark.parametrize(
-    ("G", "h"),
-    [
-        pytest.param([[1, 0], [-1, 0]], [-1, -1], id="opposite-rows"),
-        pytest.param([[1, 0], [0, 0]], [1, -1e-3], id="zero-row"),
-        pytest.param([[1, 0], [-0.5, 0.8], [-0.5, -0.8]], [-1, -1, -1], id="triangle"),
-        pytest.param([[1e-3, 0], [-1e3, 0]], [-1e-3, -1e3], id="badly-scaled"),
-    ],
-)
-def test_infeasible_rows(solver, dtype, G, h):
-    G, h = tensor(G, dtype=dtype), tensor(h, dtype=dtype)
-    solution = solve_qp(torch.eye(2, dtype=dtype), tensor([-0.3, -0.4], dtype=dtype), G, h, solver=solver)
-    assert solution.status == QPStatus.INFEASIBLE
-    assert_finite(solution)
 
 
 @BOTH
