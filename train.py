@@ -23,7 +23,7 @@ from agents.evaluation import evaluate_policy, evaluation_scalars
 from agents.incident import check_violations
 from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
-from agents.pipeline import make_buffer, make_collector, pick_device, to_transitions
+from agents.pipeline import MultiStep, make_buffer, make_collector, pick_device, to_transitions
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
 from conf.run_folder import announce_certificate, finished_run, write_json
@@ -61,6 +61,7 @@ def main(cfg: DictConfig) -> None:
     optimizers = make_optimizers(loss_module, config.agent)
     minibatches = config.env.n_agents if config.agent.minibatch == "per_agent" else 1
     buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
+    multi_step = MultiStep(config.agent.n_steps, config.agent.gamma)
     collector = make_collector(env, explore_policy, config.collector.frames_per_batch, config.collector.total_frames)
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
     writer = SummaryWriter(str(folder))
@@ -93,7 +94,7 @@ def main(cfg: DictConfig) -> None:
         save_checkpoint(folder / "checkpoints" / f"frames_{recorder.frames:012d}.pt", content)
         keep_newest(folder / "checkpoints", config.checkpoint.keep)
 
-    # ---- train: noise, then filter, then execution (explore_policy); the buffer holds executed actions
+    # ---- train: noise, then filter, then execution (explore_policy); the buffer holds executed and nominal actions
     log_due = Every(max(1, config.collector.total_frames // 200))
     eval_due, save_due = Every(config.eval.interval_frames), Every(config.checkpoint.interval_frames)
     episodes_due = Every(config.checkpoint.interval_episodes)
@@ -107,9 +108,10 @@ def main(cfg: DictConfig) -> None:
         recorder.update(batch)
         check(batch)
         transitions = to_transitions(batch, config.train.violation_penalty, adversary)
-        buffer.extend(transitions)
+        if len(steps := multi_step(transitions)):
+            buffer.extend(steps)
         collected = time.perf_counter()
-        if recorder.frames >= config.train.warmup_frames:
+        if recorder.frames >= config.train.warmup_frames and len(buffer):
             for _ in range(config.train.n_updates):
                 losses = update_step(buffer.sample(), loss_module, optimizers, target_updater, config.agent)
         updated = time.perf_counter()

@@ -16,13 +16,22 @@ class AgentConfig:
     critic_cells: list[int] = field(default_factory=lambda: [64, 64])
     """Hidden units of every critic, layer by layer, 1..4096 each."""
     share_params: bool = False
-    """One actor and one critic for all robots instead of one each."""
+    """One actor and one critic for all robots instead of one each (true with the command line's agent=maddpg and ddpg)."""
     actor_lr: float = 3e-4
     """Learning rate of the actors (Adam), (0, 1]."""
     critic_lr: float = 1e-3
     """Learning rate of the critics (Adam), (0, 1]."""
-    gamma: float = 0.95
+    critic_action: str = "auto"
+    """Which actions the critics value, and the actors are improved by. nominal: those before the filter, noise included
+    (the filter is a part of the environment). executed: those after it (the paper); the critics then know nothing of
+    actions that the filter would change, and may draw the actors there. auto: executed with safety.in_loss=true, which
+    needs it, else nominal."""
+    gamma: float = 0.99
     """Discount per step, [0, 1)."""
+    n_steps: int = 5
+    """Steps of reward in the critics' target before it bootstraps, 1..1000 (1: the paper)."""
+    initial_reward: float = -0.65
+    """Reward per step that the critics expect before they learn anything, [-1e6, 1e6]; they start at this / (1 - gamma)."""
     tau: float = 0.01
     """Soft update of the target networks, (0, 1]."""
     gradient: str = "per_agent"
@@ -30,16 +39,16 @@ class AgentConfig:
     shared: all actions are recomputed and every critic's gradient reaches every actor (TorchRL's stock loss)."""
     minibatch: str = "shared"
     """shared: one minibatch for all robots. per_agent: every robot samples its own (the paper)."""
-    noise: str = "gaussian"
+    noise: str = "ou"
     """Exploration noise, added before the filter: gaussian | ou (Ornstein-Uhlenbeck)."""
-    noise_initial: float = 0.6
+    noise_initial: float = 1.0
     """Standard deviation of the noise at the start, share of max_speed, [0, 10]."""
     noise_final: float = 0.1
     """Standard deviation of the noise at the end of the annealing, share of max_speed, [0, 10]."""
-    noise_frames: int = 500_000
+    noise_frames: int = 600_000
     """World-steps over which the noise falls linearly, >= 0 (0 = noise_final from the start)."""
-    ou_theta: float = 0.15
-    """ou: mean reversion per step, (0, 1]."""
+    ou_theta: float = 0.05
+    """ou: mean reversion per step, (0, 1]; 1/theta steps go by before the noise points elsewhere."""
     max_grad_norm: float = 0.0
     """Clip the gradient norm of all actors and of all critics to this, >= 0 (0 = off)."""
     correction_penalty: float = 0.0
@@ -59,6 +68,9 @@ class AgentConfig:
         for name in ("actor_lr", "critic_lr", "tau", "ou_theta"):
             check_range(f"agent.{name}", getattr(self, name), 0, 1, open_low=True)
         check_range("agent.gamma", self.gamma, 0, 0.999999, hint="The discount must be below 1.")
+        check_choice("agent.critic_action", self.critic_action, ("auto", "nominal", "executed"))
+        check_range("agent.n_steps", self.n_steps, 1, 1000)
+        check_range("agent.initial_reward", self.initial_reward, -1e6, 1e6)
         check_choice("agent.gradient", self.gradient, ("per_agent", "shared"))
         check_choice("agent.minibatch", self.minibatch, ("shared", "per_agent"))
         check_choice("agent.noise", self.noise, ("gaussian", "ou"))

@@ -1,8 +1,12 @@
 """The MADDPG update on TorchRL's ``DDPGLoss``; independent DDPG is its case without centralised critics.
 
-Critic of robot i: ``y = r_i + gamma (1 - terminated) Q'_i(s', pi'_1(s'_1), .., pi'_N(s'_N))``, mean squared error.
+Critic of robot i: ``y = r_i + gamma (1 - terminated) Q'_i(s', pi'_1(s'_1), .., pi'_N(s'_N))``, mean squared error; with
+n-step targets r_i is the discounted sum of n rewards, gamma is gamma^n and s' the state n steps on (fewer at an episode's
+end).
 Actor of robot i: ``grad_theta_i = mean [ grad pi_i(o_i)  grad_a_i Q_i(s, a_1, .., a_N) |_{a_i = pi_i(o_i)} ]`` with the
 other robots' actions taken from the replay sample.
+The actions are the executed ones, as in the paper, or the nominal ones, which makes the safety filter a part of the
+environment (``agent.critic_action``).
 
 Source: Lowe et al., Multi-agent actor-critic for mixed cooperative-competitive environments, arXiv 1706.02275;
 Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 1509.02971.
@@ -11,14 +15,16 @@ Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 150
 import math
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from agents.config import AgentConfig
-from agents.networks import JOINT_ACTION, STATE_ACTION_VALUE, joint_action
+from agents.networks import STATE_ACTION_VALUE, Layers, joint_action, layers_of
+from agents.pipeline import STEPS
 from envs import SurveillanceConfig, keys
+from envs.dynamics import limit_speed
 from safety import SafetyConfig, SafetyFilter
 
 
@@ -39,51 +45,113 @@ def check_finite(metrics: dict[str, float], frames: int) -> None:
 class MADDPGLoss(DDPGLoss):
     """``DDPGLoss`` with robot i's own actor gradient; losses keep the shape ``(batch, N)``, one entry per robot.
 
+    Parameters, targets and keys are ``DDPGLoss``'s. The networks are evaluated on its parameters directly: passing them
+    through TensorDict modules takes longer than the networks themselves.
+
     Args:
-        actor_network: policy that writes ("agents", "action").
-        value_network: joint action, then critic (``make_critic``).
+        actor_network: :func:`agents.networks.make_actor`, then what writes ("agents", "action").
+        value_network: joint action, then critic (:func:`agents.networks.make_critic`).
         agent: gradient form, discount and correction penalty.
         max_speed: unit of the correction penalty, m/s.
+        nominal: value the replay's nominal actions (cut to the speed ball) instead of its executed ones.
+        filtered: ``actor_network`` ends with the filter.
     """
 
     def __init__(
         self,
-        actor_network: TensorDictModuleBase,
+        actor_network: TensorDictSequential,
         value_network: TensorDictSequential,
         agent: AgentConfig,
         max_speed: float,
+        *,
+        nominal: bool,
+        filtered: bool,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True, reduction="none")
         self.agent = agent
         self.max_speed = max_speed
+        self.nominal = nominal
+        self.filtered = filtered
         self.set_keys(
             state_action_value=STATE_ACTION_VALUE, reward=keys.REWARD, done=keys.DONE, terminated=keys.TERMINATED
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
+        # Optimisers and soft update write into these tensors, so that the lists stay current.
+        actor, value = ("module", "0", "module", "net", "params"), ("module", "1", "module", "net", "params")
+        self._actor, self._target_actor, self._value, self._target_value = (
+            layers_of(params[path])
+            for params, path in (
+                (self.actor_network_params, actor),
+                (self.target_actor_network_params, actor),
+                (self.value_network_params, value),
+                (self.target_value_network_params, value),
+            )
+        )
 
-    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """``-Q_i`` at the own action, ``(batch, N)``; see the module's formula."""
-        replay_action = tensordict[keys.ACTION].detach()
-        td = tensordict.select(*self.actor_in_keys, keys.OBSERVATION).detach()
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            td = self.actor_network(td)
-        action = td[keys.ACTION]
-        others = replay_action if self.agent.gradient == "per_agent" else action
-        td.set(JOINT_ACTION, joint_action(action, others, centralized=self.agent.algorithm == "maddpg"))
-        with self._cached_detached_value_params.to_module(self.value_network, preserve_module_state=False):
-            td = self.value_network[-1](td)  # pyright: ignore[reportIndexIssue]  the critic alone: the joint action is there
-        loss = -td[STATE_ACTION_VALUE].squeeze(-1)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses of a minibatch.
+
+        Args:
+            tensordict: ``(batch,)`` transitions.
+
+        Returns:
+            "loss_actor", "loss_value", "pred_value" and "target_value", ``(batch, N)`` each.
+        """
+        observation, following = tensordict[keys.OBSERVATION], tensordict["next"]
+        action = tensordict[keys.ACTION]
+        if self.nominal:
+            action = limit_speed(tensordict[keys.NOMINAL_ACTION], self.max_speed)
+        value = self.evaluate(self._value, observation, action, action)
+        with torch.no_grad():
+            next_action, _ = self.act(self._target_actor, following)
+            future = self.evaluate(self._target_value, following[keys.OBSERVATION], next_action, next_action)
+            steps = tensordict.get(STEPS, None)
+            discount = self.agent.gamma if steps is None else self.agent.gamma ** steps.squeeze(-1)
+            reward, terminated = (following[key].squeeze(-1) for key in (keys.REWARD, keys.TERMINATED))
+            target = reward + torch.where(terminated, 0.0, discount * future)
+        own, correction = self.act(self._actor, tensordict)
+        others = action if self.agent.gradient == "per_agent" else own
+        fixed = [(weight.detach(), bias.detach()) for weight, bias in self._value]
+        loss_actor = -self.evaluate(fixed, observation, own, others)
         if self.agent.correction_penalty:
-            loss = loss + self.agent.correction_penalty * (td[keys.CORRECTION] / self.max_speed).square().squeeze(-1)
-        return loss, {}
+            loss_actor = loss_actor + self.agent.correction_penalty * (correction / self.max_speed).square()
+        return TensorDict(
+            {
+                "loss_actor": loss_actor,
+                "loss_value": (value - target).square(),
+                "pred_value": value,
+                "target_value": target,
+            }
+        )
+
+    def act(self, layers: Layers, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | float]:
+        """Actions ``(batch, N, d)`` of the policy with these layers, and what the filter corrected ``(batch, N)``."""
+        actor, safety_filter = self.actor_network  # pyright: ignore[reportGeneralTypeIssues]  a TensorDictSequential
+        action = actor.module(tensordict[keys.OBSERVATION], layers)
+        if not self.filtered:
+            return action, 0.0
+        state = tensordict.select(keys.POSITION, keys.ENERGY, keys.SLOT).set(keys.NOMINAL_ACTION, action)
+        state = safety_filter(state)
+        return state[keys.ACTION], state[keys.CORRECTION].squeeze(-1)
+
+    def evaluate(self, layers: Layers, observation: Tensor, own: Tensor, others: Tensor) -> Tensor:
+        """``Q_i(s, own_i, others)`` of the critics with these layers, ``(batch, N)``."""
+        critic = self.value_network[-1].module  # pyright: ignore[reportIndexIssue]
+        joint = joint_action(own, others, centralized=critic.centralized)
+        return critic(observation, joint, layers).squeeze(-1)
 
 
-def check_penalty(agent: AgentConfig, safety: SafetyConfig) -> None:
-    """Raise a ``ValueError`` if a correction penalty is asked for while the loss does not contain the filter."""
+def check_loss(agent: AgentConfig, safety: SafetyConfig) -> None:
+    """Raise a ``ValueError`` if the loss cannot be what both ask for."""
     if agent.correction_penalty and not safety.in_loss:
         raise ValueError(
             f"agent.correction_penalty={agent.correction_penalty} needs the filter inside the loss: "
             "set safety.in_loss=true, or the penalty to 0."
+        )
+    if agent.critic_action == "nominal" and safety.in_loss:
+        raise ValueError(
+            "safety.in_loss=true differentiates the value of the executed action through the filter: "
+            "agent.critic_action=nominal must be executed or auto."
         )
 
 
@@ -97,17 +165,17 @@ def make_loss(
     """Loss module and target updater.
 
     With ``safety.in_loss`` the filter is part of the policy inside the loss and of the target policy, and the gradient
-    flows through the quadratic program; otherwise the nominal action stands for the executed one.
+    flows through the quadratic program; otherwise the policy's nominal action stands for the executed one.
 
     Raises:
-        ValueError: if a correction penalty is asked for without ``safety.in_loss``.
+        ValueError: if a correction penalty is asked for without ``safety.in_loss``, or nominal actions with it.
     """
-    check_penalty(agent, safety)
-    if safety.in_loss:
-        executed: TensorDictModuleBase = SafetyFilter(safety, world)
-    else:
-        executed = TensorDictModule(nn.Identity(), in_keys=[keys.NOMINAL_ACTION], out_keys=[keys.ACTION])
-    loss = MADDPGLoss(TensorDictSequential(actor, executed), critic, agent, world.max_speed)
+    check_loss(agent, safety)
+    filtered = safety.in_loss
+    unfiltered = TensorDictModule(nn.Identity(), in_keys=[keys.NOMINAL_ACTION], out_keys=[keys.ACTION])
+    policy = TensorDictSequential(actor, SafetyFilter(safety, world) if filtered else unfiltered)
+    nominal = agent.critic_action != "executed" and not filtered
+    loss = MADDPGLoss(policy, critic, agent, world.max_speed, nominal=nominal, filtered=filtered)
     return loss, SoftUpdate(loss, tau=agent.tau)
 
 

@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from agents.checkpoint import CheckpointError
 from agents.incident import ViolationError
 from agents.maddpg import DivergedError
+from agents.report_runs import ReportError
 from conf.run_folder import finished_run
 from conf.schema import check_evaluation, to_config
 
@@ -25,6 +26,7 @@ EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration t
 EXPECTED_IN_RUN = (
     CheckpointError,
     DivergedError,
+    ReportError,
     ViolationError,
     OSError,
     OmegaConfBaseException,

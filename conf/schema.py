@@ -1,4 +1,4 @@
-"""Typed root configuration of train.py and evaluate.py, its checks and its registration with Hydra."""
+"""Typed root configuration of train.py and evaluate.py, its checks, and the registration of all schemas with Hydra."""
 
 import hashlib
 import json
@@ -13,14 +13,15 @@ from agents import AgentConfig, make_controller
 from agents.adversary_reward import BARRIERS, AdversaryReward
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
 from agents.controllers import CONTROLLERS
-from agents.maddpg import check_penalty
+from agents.maddpg import check_loss
 from agents.pipeline import pick_device
+from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
 from safety import SafetyConfig
 
 # Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = ("seed", "device", "resume", "debug", "checkpoint", "hydra")
+NOT_HASHED = ("seed", "device", "resume", "debug", "checkpoint", "hydra", "folder")
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -28,11 +29,11 @@ DEVICES = ("auto", "cpu", "cuda")
 class CollectorConfig:
     """Collection of transitions. Frames are world-steps."""
 
-    num_envs: int = 128
+    num_envs: int = 250
     """Worlds stepped in parallel, 1..1e6."""
     steps_per_batch: int = 1
     """Vector steps between updates, 1..1e5."""
-    total_frames: int = 832_000
+    total_frames: int = 1_000_000
     """World-steps of the whole run; a multiple of num_envs * steps_per_batch."""
 
     def __post_init__(self) -> None:
@@ -72,9 +73,9 @@ class BufferConfig:
 class TrainConfig:
     """Updates."""
 
-    n_updates: int = 1
+    n_updates: int = 4
     """Updates of all robots per collected batch, 0..1e6."""
-    warmup_frames: int = 2_000
+    warmup_frames: int = 10_000
     """World-steps collected (noisy filtered policy) before the first update, >= 0."""
     violation_penalty: float = 0.0
     """Baseline only: subtracted from a robot's reward for each violation of its own, >= 0."""
@@ -103,7 +104,7 @@ class TrainConfig:
 class EvalConfig:
     """Deterministic evaluation."""
 
-    interval_frames: int = 128_000
+    interval_frames: int = 100_000
     """World-steps between evaluations during training, >= 0 (0 = only at the end)."""
     num_envs: int = 64
     """Worlds of an evaluation, 1..1e6."""
@@ -123,7 +124,7 @@ class CheckpointConfig:
 
     interval_episodes: int = 2_000
     """Episodes between checkpoints, >= 0 (0 = do not count episodes)."""
-    interval_frames: int = 256_000
+    interval_frames: int = 250_000
     """World-steps between checkpoints, >= 0 (0 = do not count frames): for worlds whose episodes do not end."""
     keep: int = 3
     """Newest checkpoints kept, >= 0 (0 = all)."""
@@ -165,7 +166,7 @@ class Config:
         _check_common(self)
         check_choice("resume", self.resume, ("auto", "never"))
         self.safety.gains(self.env)
-        check_penalty(self.agent, self.safety)
+        check_loss(self.agent, self.safety)
         self.adversary_reward()
 
     def adversary_reward(self) -> AdversaryReward | None:
@@ -187,6 +188,8 @@ class EvaluateConfig:
     """controller=learned: folder of the run that trained it (newest checkpoint); null = the one shipped, for the default world."""
     checkpoint: str | None = None
     """File in the run's checkpoints folder, such as frames_000000100000.pt; null = the newest."""
+    folder: str = "runs/controllers"
+    """controller: where the folders of its evaluations go (a run's are in the run's own folder)."""
     steps: int = 0
     """Length of the rollout; 0 = the world's horizon (1000 where it has none)."""
     num_envs: int = 64
@@ -242,6 +245,7 @@ def register() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=Config)
     store.store(name="evaluate_schema", node=EvaluateConfig)
+    store.store(name="report_schema", node=ReportConfig)
     OmegaConf.register_new_resolver("config_hash", lambda *, _root_: config_hash(_root_), replace=True)
     OmegaConf.register_new_resolver("evaluation_folder", lambda *, _root_: evaluation_folder(_root_), replace=True)
 
@@ -320,7 +324,7 @@ def evaluation_folder(cfg: DictConfig) -> str:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
         return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
     folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
-    return str(Path("runs/controllers").absolute() / folder)
+    return str(Path(cfg.folder).absolute() / folder)
 
 
 def rollout_steps(horizon: int) -> int:

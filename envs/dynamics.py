@@ -38,6 +38,7 @@ def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
     return position + dt * velocity
 
 
+@functools.lru_cache(maxsize=64)
 def other_indices(n_agents: int, device: torch.device | None = None) -> Tensor:
     """Row i holds the other robots in cyclic order, ``i + 1, i + 2, ..``: ``(N, N - 1)`` int64."""
     robots = torch.arange(n_agents, device=device)

@@ -9,12 +9,14 @@ continuous-time ones, without margins: under a step of finite length they leak. 
 survivability row on the exact one-step map.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from envs.config import SurveillanceConfig
 from envs.dynamics import length
 from envs.homing import HomingGeometry, reserve
 
@@ -172,6 +174,40 @@ def collision_barrier(position: Tensor, *, safety_distance: float) -> BarrierRow
     value = torch.where(itself, torch.inf, offset.square().sum(-1) - safety_distance**2)
     zero = torch.zeros_like(value)
     return BarrierRow(value=value, drift=zero, velocity_gain=2 * offset, current_gain=zero)
+
+
+def literal_geometry(world: SurveillanceConfig) -> HomingGeometry:
+    """The literature's reserve: driving home at full speed, no sampled-data margin."""
+    return dataclasses.replace(world.homing, speed=world.max_speed, gain=world.max_speed / world.diameter)
+
+
+def literature_barriers(
+    position: Tensor,
+    energy: Tensor,
+    slot_position: Tensor,
+    field: Tensor,
+    geometry: HomingGeometry,
+    world: SurveillanceConfig,
+) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
+    """The three rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state of this world.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        energy: ``(*B, N)``.
+        slot_position: ``(*B, N, d)``, m.
+        field: ``(*B, N)``, charging field ``w(p)``.
+        geometry: of :func:`literal_geometry`.
+        world: the world.
+
+    Returns:
+        Survivability, overcharge, collision.
+    """
+    rates = {"charge_rate": world.charge_rate}
+    return (
+        energy_barrier(position, energy, slot_position, field, geometry, **rates),
+        overcharge_barrier(energy, field, energy_max=world.energy_max, drain_rate=world.drain_rate, **rates),
+        collision_barrier(position, safety_distance=world.safety_distance),
+    )
 
 
 def accepted_current(row: BarrierRow, alpha: float) -> tuple[Tensor, Tensor]:

@@ -31,7 +31,8 @@ class SafetyConfig:
 
     mode: str = "certified"
     """certified: rows centred on the homing certificate, and the shield. paper: control barrier function quadratic
-    program of the literature. none: speed limit only."""
+    program of the literature. dalal: learned linear constraint models, correction in closed form (safety/dalal.py).
+    none: speed limit only. composition, split, sampled_data, gains and solver are ignored by dalal and none."""
     composition: str = "stacked"
     """stacked: one row per barrier. min: one row per robot, of its smallest barrier (the paper's h_i)."""
     split: str = "auto"
@@ -53,13 +54,22 @@ class SafetyConfig:
     """auto: exact for one robot's problem, active_set for the joint one. exact | active_set | pdipm | qpth choose."""
     in_loss: bool = False
     """Put the filter into the policy that the loss differentiates (gradient through the QP), and into its target."""
+    dalal_margin: float = 3.0
+    """dalal: distance that the models keep from every limit, [0, 100]: the energy drained, and the gap closed by one
+    robot, in this many steps. 0 is the bare limit."""
+    dalal_steps: int = 3000
+    """dalal: optimiser steps of the fit before training, 1..1000000."""
+    dalal_drift: bool = True
+    """dalal: let the models have a part that does not depend on the action. false: the source's model."""
 
     def __post_init__(self) -> None:
         """Check every field and their combination."""
-        check_choice("safety.mode", self.mode, ("certified", "paper", "none"))
+        check_choice("safety.mode", self.mode, ("certified", "paper", "dalal", "none"))
         check_choice("safety.composition", self.composition, ("stacked", "min"))
         check_choice("safety.split", self.split, ("auto", "anchor", "half", "full", "joint"))
         check_choice("safety.solver", self.solver, ("auto", "exact", "active_set", "pdipm", "qpth"))
+        check_range("safety.dalal_margin", self.dalal_margin, 0, 100)
+        check_range("safety.dalal_steps", self.dalal_steps, 1, 10**6)
         certified = self.mode == "certified"
         if certified and (self.composition != "stacked" or not self.sampled_data):
             raise ValueError(
@@ -67,7 +77,7 @@ class SafetyConfig:
                 f"safety.sampled_data={self.sampled_data} belong to safety.mode=paper."
             )
         allowed = ("auto", "anchor", "half") if certified else ("auto", "half", "full", "joint")
-        if self.split not in allowed and self.mode != "none":
+        if self.split not in allowed and self.mode in ("certified", "paper"):
             raise ValueError(
                 f"safety.split={self.split} does not fit safety.mode={self.mode}: choose {', '.join(allowed)}."
             )
@@ -100,7 +110,7 @@ class SafetyConfig:
             check_range(f"safety.{name}", gain, 0, most / world.dt, open_low=True, hint=hint)
             values.append(gain)
         gains = Gains(*values)
-        if self.mode != "none":
+        if self.mode in ("certified", "paper"):
             self._check_throttle(world, gains)
         if self.mode == "certified":
             self._check_clearance(world, gains)

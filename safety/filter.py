@@ -13,9 +13,9 @@ ever relaxed: a problem without solution, or one the solver could not solve to i
   program, 1 hold, 2 homing.
 * ``mode=paper``: the rows are the literature's and hold is the last resort, so holding, another robot or the length of a
   step can still lead to a violation; the environment counts those.
+* ``mode=dalal``: no program, the learned layer of :mod:`safety.dalal`; its violations are counted too.
 """
 
-import dataclasses
 import functools
 
 import torch
@@ -32,14 +32,15 @@ from envs.transition import transition
 from safety.barriers import (
     BarrierRow,
     accepted_current,
-    collision_barrier,
-    energy_barrier,
+    literal_geometry,
+    literature_barriers,
     overcharge_barrier,
     sampled_energy_row,
 )
 from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
 from safety.certified_rows import Rows, certified_rows
 from safety.config import SafetyConfig
+from safety.dalal import DalalLayer
 from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
 from safety.speed_faces import face_normals, joint_rows
 
@@ -53,7 +54,7 @@ class SafetyFilter(TensorDictModuleBase):
     * out: action ``(*B, N, d)`` m/s in the speed ball, charge_current ``(*B, N, 1)`` in [0, 1], correction
       ``(*B, N, 1)`` = ||u - u^|| with u^ first cut to the speed ball, status and level ``(*B, N)`` int64, residual
       and the barriers h_c, h_o, h_s (smallest over the pairs) ``(*B, N, 1)``, outside ``(*B, N)`` bool: a state that
-      the filter makes no promise for (certified: not in the certified set, the robot drives home; paper: a barrier is
+      the filter makes no promise for (certified: not in the certified set, the robot drives home; others: a barrier is
       negative). h_c takes the filter's own reserve. certified also writes h_g = G - Delta_G ``(*B, N, 1)``, the
       smallest over the pairs.
 
@@ -76,8 +77,7 @@ class SafetyFilter(TensorDictModuleBase):
         self.safety = safety
         self.world = world
         self.gains = safety.gains(world)
-        # The literature's reserve: full speed, no sampled-data margin.
-        self.literal = dataclasses.replace(world.homing, speed=world.max_speed, gain=world.max_speed / world.diameter)
+        self.literal = literal_geometry(world)
         self.geometry = world.homing
         self._joint_solver = "active_set" if safety.solver in ("auto", "exact") else safety.solver
         self.in_keys = [keys.NOMINAL_ACTION, keys.POSITION, keys.ENERGY, keys.SLOT]
@@ -88,6 +88,7 @@ class SafetyFilter(TensorDictModuleBase):
         if safety.mode == "certified":
             self.out_keys.append(keys.BARRIER_CERTIFICATE)
         self._transition = compiled(functools.partial(transition, config=world), enabled=compile)
+        self.layer = DalalLayer(safety, world) if safety.mode == "dalal" else None
         self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -134,7 +135,8 @@ class SafetyFilter(TensorDictModuleBase):
                 status = level = torch.zeros_like(slot)
                 residual = torch.zeros_like(energy)
             else:
-                action, current, status, residual = self._program(target, position, energy, slot, h_c, h_o, h_s)
+                solve = self.layer or self._program
+                action, current, status, residual = solve(target, position, energy, slot, h_c, h_o, h_s)
                 status = torch.where(finite, status, int(QPStatus.INACCURATE))
                 hold = status != QPStatus.SOLVED
                 action = torch.where(hold.unsqueeze(-1), 0.0, action)
@@ -319,14 +321,8 @@ class SafetyFilter(TensorDictModuleBase):
 
     def _barriers(self, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[BarrierRow, BarrierRow, BarrierRow]:
         """The literature's rows ``h_c (*B, N)``, ``h_o (*B, N)`` and ``h_s (*B, N, N)`` of a state."""
-        world, field = self.world, self._field(position)
-        slots = self._layout(position)[1]
-        rates = {"charge_rate": world.charge_rate}
-        return (
-            energy_barrier(position, energy, slots[slot], field, self.literal, **rates),
-            overcharge_barrier(energy, field, energy_max=world.energy_max, drain_rate=world.drain_rate, **rates),
-            collision_barrier(position, safety_distance=world.safety_distance),
-        )
+        home = self._layout(position)[1][slot]
+        return literature_barriers(position, energy, home, self._field(position), self.literal, self.world)
 
     def _layout(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Stations, slots and arena on the device and in the type of ``like``. Not buffers: the loss must not copy them."""

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("envs", "safety", "agents", "conf")
-TOP = ("train", "evaluate")
+TOP = ("train", "evaluate", "report")
 # importer: what it may not import of this project
 FORBIDDEN = {
     "envs": {"safety", "agents", "conf", *TOP},

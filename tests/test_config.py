@@ -8,6 +8,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import evaluate
 import train
+from agents import AgentConfig
 from conf.schema import Config, config_hash, to_config
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -96,6 +97,7 @@ BAD = [
     ("env.energy_min=2", "energy_max"),
     ("safety.alpha_s=100", "(0, 5.0]"),
     ("safety.split=all", "half, full, joint"),
+    ("safety.dalal_margin=-1", "[0, 100]"),
     ("collector.total_frames=1000", "nearest that is, is 992"),
     ("agent.gamma=1", "below 1"),
     ("agent.correction_penalty=1", "safety.in_loss=true"),
@@ -141,6 +143,6 @@ def test_debug_shows_the_traceback(program):
 
 
 def test_yaml_files_hold_differences_only():
-    """A value in env/default.yaml would silently differ from SurveillanceConfig() in Python."""
-    assert to_config(composed()) == Config()
+    """A value in env/default.yaml would silently differ from SurveillanceConfig() in Python; one is meant to."""
+    assert to_config(composed()) == Config(agent=AgentConfig(share_params=True))
     assert Path(CONF / "env" / "default.yaml").read_text().strip().endswith("{}")

@@ -466,7 +466,7 @@ def test_gain_beyond_one_over_dt_is_refused(name):
     [
         ({"composition": "min"}, r"safety\.sampled_data=true needs safety\.composition=stacked"),
         ({"split": "joint", "solver": "exact"}, r"safety\.solver='exact'.*safety\.split='joint'"),
-        ({"mode": "nothing"}, r"safety\.mode='nothing'.*certified, paper, none"),
+        ({"mode": "nothing"}, r"safety\.mode='nothing'.*certified, paper, dalal, none"),
         ({"split": "third"}, r"safety\.split='third'.*anchor, half, full, joint"),
         ({"split": "anchor"}, r"safety\.split=anchor does not fit safety\.mode=paper.*half, full, joint"),
         (

@@ -8,14 +8,14 @@ from tensordict import TensorDict
 
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
-from agents.networks import make_actor, make_critic, make_policies
-from agents.pipeline import make_buffer, to_transitions
+from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
+from agents.pipeline import MultiStep, make_buffer, to_transitions
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
 torch.set_num_threads(1)
 N, D = 3, 2
-SMALL = {"actor_cells": [8], "critic_cells": [8, 6]}
+SMALL = {"actor_cells": [8], "critic_cells": [8, 6], "critic_action": "executed", "gamma": 0.95, "initial_reward": 0.0}
 NEXT_TERMINATED = ("next", *keys.TERMINATED)
 NEXT_DONE = ("next", *keys.DONE)
 
@@ -34,7 +34,7 @@ class Setup:
         _, explore = make_policies(self.actor, self.world, self.safety, self.agent, 0, torch.device("cpu"))
         with torch.no_grad():
             self.actor.module.net.params["2"]["weight"].mul_(speed_up)
-            self.batch = to_transitions(env.rollout(10, explore, break_when_any_done=False))
+            self.batch = to_transitions(env.rollout(10, explore, break_when_any_done=False)).reshape(-1)
         assert self.batch.shape == (80,)
         self.loss, self.updater = make_loss(self.actor, self.critic, self.agent, self.safety, self.world)
         with torch.no_grad():  # let online and target networks differ
@@ -64,11 +64,14 @@ class Setup:
         return torch.stack(actions, 1)
 
     def value(self, layers, i, observation, action):
-        """``Q_i`` by hand, ``(B,)``."""
+        """``Q_i`` by hand, ``(B,)``: robot i first, the others in cyclic order."""
         action = action / self.world.max_speed
         if self.agent.algorithm == "ddpg":
             return mlp(layers, i, torch.cat([observation[:, i], action[:, i]], -1)).squeeze(-1)
-        return mlp(layers, i, torch.cat([observation.flatten(1), action.flatten(1)], -1)).squeeze(-1)
+        order = [(i + k) % N for k in range(N)]
+        return mlp(layers, i, torch.cat([observation[:, order].flatten(1), action[:, order].flatten(1)], -1)).squeeze(
+            -1
+        )
 
     def filtered(self, nominal, td):
         """Filter on the states of ``td``: action and correction ``(B, N)``."""
@@ -372,6 +375,107 @@ def test_correction_penalty_needs_the_filter_in_the_loss():
         Setup(correction_penalty=0.5)
 
 
+# ---- values of nominal actions -----------------------------------------------------------------------------------------
+def test_nominal_actions_are_valued_on_request():
+    nominal, executed = (Setup(noise_initial=3.0, critic_action=kind) for kind in ("nominal", "executed"))
+    batch, speed = nominal.batch, nominal.world.max_speed
+    action = batch[keys.NOMINAL_ACTION]
+    norm = action.norm(dim=-1, keepdim=True)
+    assert (norm > 1.5 * speed).any()  # explored actions are cut to the speed ball
+    action = torch.where(norm > speed, action * speed / norm, action)
+    assert (action - batch[keys.ACTION]).norm(dim=-1).max() > 0.5 * speed  # the filter had something to do
+    for s, kind in ((nominal, "nominal"), (executed, "executed")):
+        actor, critic = s.networks("online")
+        taken = action if kind == "nominal" else batch[keys.ACTION]
+        out = s.loss(batch)
+        policy = s.act(actor, batch[keys.OBSERVATION])
+        for i in range(N):
+            value = s.value(critic, i, batch[keys.OBSERVATION], taken)
+            torch.testing.assert_close(out["pred_value"][:, i], value, rtol=1e-5, atol=1e-5)
+            own = taken.clone()
+            own[:, i] = policy[:, i]
+            expected = -s.value(critic, i, batch[keys.OBSERVATION], own)
+            torch.testing.assert_close(out["loss_actor"][:, i], expected, rtol=1e-5, atol=1e-5)
+    assert torch.equal(nominal.batch[keys.ACTION], executed.batch[keys.ACTION])  # the batch itself stays
+
+
+def test_auto_values_executed_actions_only_with_the_filter_in_the_loss():
+    values = {}
+    for kind, safety in (("auto", {}), ("nominal", {}), ("executed", {}), ("auto", {"in_loss": True})):
+        s = Setup(noise_initial=3.0, critic_action=kind, safety=safety)
+        values[kind, bool(safety)] = s.loss(s.batch)["pred_value"]
+    assert torch.equal(values["auto", False], values["nominal", False])
+    assert torch.equal(values["auto", True], values["executed", False])
+    assert not torch.allclose(values["auto", False], values["auto", True])
+
+
+def test_nominal_actions_do_not_go_with_the_filter_in_the_loss():
+    with pytest.raises(
+        ValueError, match=r"safety\.in_loss=true.*agent\.critic_action=nominal must be executed or auto"
+    ):
+        Setup(critic_action="nominal", safety={"in_loss": True})
+
+
+# ---- n-step targets ------------------------------------------------------------------------------------------------------
+def test_n_step_transitions_and_targets():
+    n, gamma, worlds, steps = 3, 0.9, 4, 23
+    world = SurveillanceConfig(dtype="float64", horizon=8)
+    env = SurveillanceEnv(world, worlds, seed=0)
+    agent = AgentConfig(**(SMALL | {"gamma": gamma, "n_steps": n}))
+    torch.manual_seed(0)
+    actor, critic = (make(env.n_observation, world, agent) for make in (make_actor, make_critic))
+    _, explore = make_policies(actor, world, SafetyConfig(), agent, 0, torch.device("cpu"))
+    with torch.no_grad():
+        rollout = to_transitions(env.rollout(steps, explore, break_when_any_done=False))
+    rollout["next"][keys.REWARD] = torch.randn(worlds, steps, N, 1, dtype=torch.float64)
+    ends = [t for t in range(steps) if (t + 1) % 8 == 0]
+    multi_step, parts = MultiStep(n, gamma), []
+    for first, last in ((0, 2), (2, 3), (3, 9), (9, steps)):  # batches of any length
+        parts.append(multi_step(rollout[:, first:last]))
+    assert [len(p) > 0 for p in parts] == [False, False, True, True]
+    merged = torch.cat(parts[2:])
+    assert len(merged) == worlds * (steps - n)
+    by_position = {tuple(row[keys.POSITION].flatten().tolist()): row for row in merged}
+    loss, _ = make_loss(actor, critic, agent, SafetyConfig(), world)
+    for b, t in itertools.product(range(worlds), range(steps - n)):
+        row = by_position[tuple(rollout[b, t][keys.POSITION].flatten().tolist())]
+        last = min([t + n - 1] + [e for e in ends if e >= t])
+        assert (row["steps_to_next_obs"] == last - t + 1).all()
+        expected = sum(gamma**k * rollout["next"][keys.REWARD][b, t + k] for k in range(last - t + 1))
+        torch.testing.assert_close(row["next"][keys.REWARD], expected)
+        for key in (keys.OBSERVATION, keys.POSITION, keys.ENERGY, keys.SLOT, keys.DONE, keys.TERMINATED):
+            assert torch.equal(row["next"][key], rollout["next"][key][b, last])
+        assert torch.equal(row[keys.ACTION], rollout[keys.ACTION][b, t])
+    out = loss(merged)
+    following = merged["next"].clone().select(keys.OBSERVATION)
+    with loss.target_actor_network_params.to_module(loss.actor_network, preserve_module_state=False):
+        following = loss.actor_network(following)
+    with loss.target_value_network_params.to_module(loss.value_network, preserve_module_state=False):
+        future = loss.value_network(following)[STATE_ACTION_VALUE]
+    expected = merged["next"][keys.REWARD] + gamma ** merged["steps_to_next_obs"] * future
+    torch.testing.assert_close(out["target_value"], expected.squeeze(-1))
+
+
+def test_n_step_transition_ends_with_a_violation():
+    reward = torch.tensor([1.0, 10.0, 100.0, 1000.0, 1e4, 1e5]).view(1, 6, 1, 1).expand(1, 6, N, 1).clone()
+    s = Setup()
+    rollout = s.batch[:6].clone().reshape(1, 6)
+    rollout["next"][keys.REWARD] = reward.double()
+    flag = torch.zeros(1, 6, 1, dtype=torch.bool)
+    flag[0, 1] = True
+    for key in (("next", "done"), NEXT_DONE, NEXT_TERMINATED):
+        rollout[key] = flag if key == ("next", "done") else flag.unsqueeze(-1).expand(1, 6, N, 1).clone()
+    merged = MultiStep(3, 0.5)(rollout)
+    assert merged["next"][keys.REWARD][:, 0, 0].tolist() == [1 + 5.0, 10.0, 100 + 500 + 2500]
+    assert merged[NEXT_TERMINATED][:, 0, 0].tolist() == [True, True, False]
+
+
+def test_one_step_passes_through():
+    s = Setup()
+    rollout = s.batch.reshape(8, 10)
+    assert (MultiStep(1, 0.9)(rollout) == s.batch).all()
+
+
 # ---- what is stored --------------------------------------------------------------------------------------------------
 def test_transitions_hold_the_executed_action_and_all_the_filter_reads():
     s = Setup(noise_initial=3.0)
@@ -392,8 +496,8 @@ def test_violation_penalty_is_charged_to_the_violator():
     for kind in keys.VIOLATION_KINDS:
         batch["next"][(*keys.VIOLATION, kind)] = flags if kind in ("collision", "stranded") else torch.zeros_like(flags)
     got = to_transitions(batch, violation_penalty=5.0)["next"][keys.REWARD]
-    expected = torch.full((6, N, 1), -1.0)
-    expected[5, 0] = -11.0
+    expected = torch.full((2, 3, N, 1), -1.0)
+    expected[1, 2, 0] = -11.0
     assert torch.equal(got, expected)
     assert (to_transitions(batch)["next"][keys.REWARD] == -1).all()
 

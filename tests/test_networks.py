@@ -3,12 +3,15 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
+from torchrl.modules import MultiAgentMLP
 
 from agents import AgentConfig
 from agents.networks import (
     JOINT_ACTION,
     STATE_ACTION_VALUE,
     BallActor,
+    BatchedMLP,
     Critic,
     ExplorationNoise,
     joint_action,
@@ -89,15 +92,35 @@ def test_layers_and_type_follow_the_configuration():
 
 # ---- joint action and critics ----------------------------------------------------------------------------------------
 @DIMENSIONS
-def test_joint_action_replaces_the_own_entry_only(d):
+def test_joint_action_replaces_the_own_entry_only_and_puts_it_first(d):
     own, others = randn(B, 4, d), randn(B, 4, d, seed=1)
     joint = joint_action(own, others, centralized=True)
     assert joint.shape == (B, 4, 4 * d)
     for i in range(4):
         expected = others.clone()
         expected[:, i] = own[:, i]
-        assert torch.equal(joint[:, i], expected.reshape(B, 4 * d))
+        assert torch.equal(joint[:, i], expected.roll(-i, 1).reshape(B, 4 * d))
     assert torch.equal(joint_action(own, others, centralized=False), own)
+
+
+@SHARED
+def test_networks_are_torchrls(share):
+    inputs = randn(B, 3, N_OBS)
+    net = BatchedMLP(N_OBS, 2, 3, centralized=False, share_params=share, num_cells=[7, 5], activation_class=nn.ReLU)
+    twin = MultiAgentMLP(N_OBS, 2, 3, centralized=False, share_params=share, num_cells=[7, 5], activation_class=nn.ReLU)
+    twin.load_state_dict(net.state_dict())
+    for x in (inputs, inputs[0], inputs.reshape(1, B, 3, N_OBS)):
+        torch.testing.assert_close(net(x), twin(x), rtol=1e-5, atol=1e-6)
+    gradients = [torch.autograd.grad(n(inputs).square().sum(), list(n.parameters())) for n in (net, twin)]
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_values_start_at_the_expected_return():
+    agent = AgentConfig(initial_reward=-0.5, gamma=0.98)
+    plain, shifted = (seeded(Critic, N_OBS, world_of(), a) for a in (AgentConfig(initial_reward=0.0), agent))
+    observation, joint = randn(B, 3, N_OBS), randn(B, 3, 6)
+    torch.testing.assert_close(shifted(observation, joint), plain(observation, joint) - 25.0)
 
 
 def critic_gradients(algorithm):
@@ -225,7 +248,7 @@ def test_noise_continues_from_its_state(kind):
 # ---- policies --------------------------------------------------------------------------------------------------------
 def policies(noise=3.0, **safety):
     world = SurveillanceConfig()
-    agent = AgentConfig(noise_initial=noise, noise_final=noise)
+    agent = AgentConfig(noise="gaussian", noise_initial=noise, noise_final=noise)
     env = SurveillanceEnv(world, 32, seed=0)
     actor = seeded(make_actor, env.n_observation, world, agent)
     policy, explore = make_policies(actor, world, SafetyConfig(**safety), agent, 0, torch.device("cpu"))

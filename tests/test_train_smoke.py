@@ -21,6 +21,8 @@ VARIANTS = {
     "literal filter": ("safety=paper",),
     "stacked filter": ("safety=stacked",),
     "unfiltered": ("safety=none",),
+    "learned layer": ("safety=dalal", "safety.dalal_steps=20"),
+    "learned layer in the loss": ("safety=dalal", "safety.dalal_steps=20", "safety.in_loss=true"),
     "joint filter": ("safety=joint",),
     "filter in the loss": ("safety.in_loss=true", "agent.correction_penalty=0.1"),
     "joint filter in the loss": ("safety=joint", "safety.in_loss=true"),

@@ -70,7 +70,7 @@ def update_rows(world: SurveillanceConfig, options, budget: harness.Budget) -> I
     _, explore = make_policies(updates["MADDPG"][0], world, SafetyConfig(), agent, 0, env.device)
     with torch.no_grad():
         steps = -(-options.batches[-1] // 256)
-        transitions = to_transitions(env.rollout(steps, explore, break_when_any_done=False))
+        transitions = to_transitions(env.rollout(steps, explore, break_when_any_done=False)).reshape(-1)
     for size in options.batches:
         batch = transitions[:size]
         chains = {name: (lambda u=update, b=batch: u(b),) for name, (_, update) in updates.items()}
@@ -93,7 +93,7 @@ def training_rows(world: SurveillanceConfig, options, budget: harness.Budget) ->
         buffer, batches = make_buffer(100_000, options.batches[0], env.device, 0), iter(collector)
 
         def learn(batch: TensorDictBase, buffer=buffer, update=update) -> None:
-            buffer.extend(to_transitions(batch))
+            buffer.extend(to_transitions(batch).reshape(-1))
             update(buffer.sample())
 
         chains[name] = (lambda batches=batches: next(batches), learn)

@@ -1,0 +1,255 @@
+"""Find the runs below a folder, read what they measured, and refuse what cannot be compared.
+
+A run is a folder of train.py (``.hydra/``, ``summary.json``, TensorBoard events) or of a controller's evaluation by
+evaluate.py (``.hydra/``, ``eval.json``). Runs are replications of each other where world and method are the same and
+the seed differs. What lies inside a run's folder (``eval/``, ``replaced_<k>/``) is not another run.
+"""
+
+import json
+import os
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+# Overrides that belong to the world or to no method: they do not name one.
+UNNAMED = {"seed", "env", "device", "resume", "debug", "compile", "checkpoint", "eval", "hydra", "experiment", "method"}
+UNNAMED_EVALUATION = UNNAMED | {"controller", "steps", "num_envs", "pictures", "restart"}
+SHOWN = 3  # names per problem in an error: messages have at most 8 lines
+
+
+class ReportError(ValueError):
+    """Runs that cannot be reported; the message names them and says what to do."""
+
+
+@dataclass
+class Run:
+    """One run, finished or not."""
+
+    folder: Path
+    name: str  # path below the sweep
+    world: str
+    method: str
+    seed: int
+    learned: bool  # by train.py; otherwise a controller's evaluation
+    config_hash: str
+    env: dict  # the world's configuration
+    protocol: str  # how J was measured
+    n_agents: int
+    git_hash: str = ""
+    finished: bool = False
+    numbers: dict[str, float] = field(default_factory=dict)
+    """Every number of summary.json or eval.json by dotted name: ``eval.coverage_cost``, ``train.violations.collision``,
+    ``train.filter.fallback_rate``, ``eval.filter.…`` (controllers only), ``train.robot_steps``; NaN for null."""
+    others: list[str] = field(default_factory=list)  # evaluations inside the run's folder
+
+    @property
+    def label(self) -> str:
+        """World, method and seed."""
+        return f"{self.world} / {self.method} / seed {self.seed}"
+
+
+def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run]:
+    """All runs at any depth below ``sweep``, finished or not, by world, method and seed.
+
+    Args:
+        sweep: folder to search.
+        config_hash: digest of a resolved configuration that is the same for all seeds.
+
+    Raises:
+        ReportError: the folder does not exist, holds no run, or a run's JSON cannot be read.
+    """
+    if not sweep.is_dir():
+        raise ReportError(f"sweep={sweep} is not a folder.")
+    found = [run for folder in _run_folders(sweep) if (run := read_run(folder, sweep, config_hash))]
+    if not found:
+        raise ReportError(
+            f"sweep={sweep} holds no runs: no folder below it was written by train.py or by evaluate.py controller=…"
+        )
+    return sorted(found, key=lambda run: (run.world, run.method, run.seed, run.name))
+
+
+def _run_folders(sweep: Path) -> Iterable[Path]:
+    for path, names, _ in os.walk(sweep):
+        folder = Path(path)
+        if (folder / ".hydra" / "config.yaml").is_file():
+            names.clear()
+            yield folder
+        else:
+            names[:] = [name for name in names if not re.fullmatch(r"replaced_\d+|\..*", name)]
+
+
+def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]) -> Run | None:
+    """The run in ``folder``; None if another program wrote it, or if it evaluates a trained run."""
+    config: Any = OmegaConf.load(folder / ".hydra" / "config.yaml")
+    learned = "collector" in config
+    if not learned and config.get("controller") is None:
+        return None
+    hydra = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra
+    choices, overrides = hydra.runtime.choices, [str(entry).lstrip("+~") for entry in hydra.overrides.task]
+    steps = (config.eval.steps if learned else config.steps) or config.env.horizon or 1000  # conf.schema.rollout_steps
+    restart = ", worlds drawn anew after a violation" if config.get("restart") else ""
+    run = Run(
+        folder=folder,
+        name=folder.relative_to(sweep).as_posix(),
+        world=" ".join([choices.env, *sorted(entry[4:] for entry in overrides if entry.startswith("env."))]),
+        method=_method(config, choices, overrides),
+        seed=config.seed,
+        learned=learned,
+        config_hash=config_hash(config),
+        env=dict(config.env),
+        protocol=f"{steps} steps{restart}",
+        n_agents=config.env.n_agents,
+        others=sorted(path.parent.relative_to(sweep).as_posix() for path in folder.glob("eval/*/eval.json")),
+    )
+    path = folder / ("summary.json" if learned else "eval.json")
+    if path.is_file():
+        try:
+            content = json.loads(path.read_text())
+            run.numbers = _training_numbers(content, run) if learned else _evaluation_numbers(content)
+            run.git_hash, run.finished = content["git_hash"], True
+            run.config_hash = content.get("config_hash", run.config_hash)
+        except (json.JSONDecodeError, KeyError) as error:
+            raise ReportError(f"{path} cannot be read ({type(error).__name__}: {error}).") from error
+    return run
+
+
+def _method(config: DictConfig, choices: DictConfig, overrides: list[str]) -> str:
+    """Name of what is compared: the choice of group ``method``, a controller and its filter, or the overrides."""
+    if choices.get("method", "default") != "default":
+        return choices.method
+    if config.get("controller") is not None:
+        own = [entry for entry in overrides if not entry.startswith("safety=")]
+        return " ".join([f"{config.controller} + {choices.safety}", *_named(own, UNNAMED_EVALUATION)])
+    experiment = [choices.experiment] if any(entry.startswith("experiment=") for entry in overrides) else []
+    return " ".join([*experiment, *_named(overrides, UNNAMED)]) or choices.experiment
+
+
+def _named(overrides: list[str], unnamed: set[str]) -> list[str]:
+    return sorted(entry for entry in overrides if re.split(r"[.=@]", entry)[0] not in unnamed)
+
+
+def _flat(content: Any, prefix: str) -> dict[str, float]:
+    """Numbers of a nested object by dotted name; null is NaN, text and lists are left out."""
+    if isinstance(content, dict):
+        return {
+            name: value for key, inner in content.items() for name, value in _flat(inner, f"{prefix}.{key}").items()
+        }
+    if content is None:
+        return {prefix: np.nan}
+    return {prefix: content} if isinstance(content, int | float) and not isinstance(content, bool) else {}
+
+
+def _training_numbers(content: dict, run: Run) -> dict[str, float]:
+    names = ("frames", "episodes", "wall_time_s", "frames_per_second")
+    numbers = {name: content[name] for name in names} | {"train.robot_steps": content["frames"] * run.n_agents}
+    train = _flat(content["train"], "train") | _flat(content["filter"], "train.filter")
+    return numbers | train | _flat(content["eval"], "eval")
+
+
+def _evaluation_numbers(content: dict) -> dict[str, float]:
+    beside = {"filter", "env", "safety", "certificate", "steps", "num_envs", "seed", "adversary", "wall_time_s"}
+    metrics = {name: value for name, value in content.items() if name not in beside}
+    metrics["coverage_cost"] = content["coverage_cost"]  # KeyError if this is another program's file
+    return {"wall_time_s": content["wall_time_s"]} | _flat(metrics, "eval") | _flat(content["filter"], "eval.filter")
+
+
+def check_runs(runs: list[Run], *, incomplete: bool = False) -> tuple[list[Run], list[str]]:
+    """The runs to report and what the reader must know about them.
+
+    Args:
+        runs: from :func:`find_runs`.
+        incomplete: report what there is where runs are unfinished or seeds missing.
+
+    Returns:
+        The finished runs and the warnings, one line each.
+
+    Raises:
+        ReportError: unfinished or missing runs (not with ``incomplete``), several runs of one seed, or several
+            configurations under one name.
+    """
+    finished, groups = [run for run in runs if run.finished], defaultdict(list)
+    for run in finished:
+        groups[run.world, run.method].append(run)
+    twice = [
+        f"{same[0].label} ({', '.join(run.name for run in same)})"
+        for group in groups.values()
+        for seed in sorted({run.seed for run in group})
+        if len(same := [run for run in group if run.seed == seed]) > 1
+    ]
+    mixed = [
+        f"{world} / {method} ({_count(run.config_hash for run in group)})"
+        for (world, method), group in groups.items()
+        if len({run.config_hash for run in group}) > 1
+    ]
+    if twice or mixed:
+        lines = [_listed("several runs of one seed", twice), _listed("configuration hashes that differ", mixed)]
+        raise ReportError("\n".join(["runs that are no replications of each other:", *filter(None, lines)]))
+    unfinished = [run.name for run in runs if not run.finished]
+    missing = []
+    started = {(run.world, run.method, run.seed) for run in runs}
+    for world, method in sorted({key[:2] for key in started}):
+        seeds = sorted({run.seed for run in runs if run.world == world})
+        missing += [f"{world} / {method} / seed {s}" for s in seeds if (world, method, s) not in started]
+    lines = [_listed("unfinished", unfinished), _listed("missing, though other methods have the seed", missing)]
+    if any(lines) and not incomplete:
+        head = "the sweep is incomplete (incomplete=true reports what there is):"
+        raise ReportError("\n".join([head, *filter(None, lines)]))
+    if not finished:
+        raise ReportError(f"none of the {len(runs)} runs is finished.")
+    unlisted = [_listed("unfinished", unfinished, None), _listed("missing seeds", missing, None)]
+    return finished, [*filter(None, unlisted), *_warnings(finished)]
+
+
+def _warnings(runs: list[Run]) -> list[str]:
+    """Differences between runs that do not forbid a comparison but may decide it."""
+    lines = []
+    if len({run.git_hash for run in runs}) > 1:
+        lines.append(f"runs of different commits: {_count(run.git_hash[:12] for run in runs)}")
+    for world in sorted({run.world for run in runs}):
+        own = [run for run in runs if run.world == world]
+        if len({run.protocol for run in own}) > 1:
+            lines.append(f"world {world}: J is measured over {_count(run.protocol for run in own)}")
+        for name in sorted({name for run in own for name in run.env}):
+            if len({str(run.env.get(name)) for run in own}) > 1:
+                lines.append(f"world {world}: env.{name} is {_count(str(run.env.get(name)) for run in own)}")
+        budgets = [f"{run.numbers['frames']} frames" for run in own if run.learned]
+        if len(set(budgets)) > 1:
+            lines.append(f"world {world}: trained for {_count(budgets)}")
+    unmeasured = [run.label for run in runs if not np.isfinite(run.numbers["eval.coverage_cost"])]
+    return [*lines, *filter(None, [_listed("no finite J", unmeasured, None)])]
+
+
+def _count(names: Iterable[str]) -> str:
+    names = list(names)
+    return ", ".join(f"{name} ({names.count(name)} runs)" for name in sorted(set(names)))
+
+
+def _listed(title: str, names: list[str], shown: int | None = SHOWN) -> str:
+    if not names:
+        return ""
+    more = f" and {len(names) - shown} more" if shown and len(names) > shown else ""
+    return f"{title}: {', '.join(names[:shown])}{more}"
+
+
+def read_curves(run: Run) -> dict[str, np.ndarray]:
+    """What a training run logged, by TensorBoard tag.
+
+    Returns:
+        Arrays ``(T, 3)``: frames (ascending, no two the same), seconds since the first event, value. Empty where there
+        are no events.
+    """
+    events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0}).Reload()
+    tags = events.Tags()["scalars"]
+    start = events.FirstEventTimestamp() if tags else 0.0
+    curves = {}
+    for tag in tags:
+        last = {entry.step: (entry.wall_time - start, entry.value) for entry in events.Scalars(tag)}  # of a resumed run
+        curves[tag] = np.array([(step, *last[step]) for step in sorted(last)], dtype=float)
+    return curves

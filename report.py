@@ -1,0 +1,70 @@
+"""Compare the runs of a sweep: tables and learning curves with confidence intervals over the seeds.
+
+``python report.py sweep=<folder>`` writes ``<folder>/report/``; ``python report.py --help`` says what and from what.
+"""
+
+import logging
+import tempfile
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from agents.report_figures import save_figures
+from agents.report_runs import Run, check_runs, find_runs, read_curves
+from agents.report_statistics import Bootstrap, Groups, compute_curves, compute_rows
+from agents.report_tables import Report, find_method, write_curves, write_rows, write_runs
+from conf.callbacks import one_clear_error
+from conf.report_schema import ReportConfig
+from conf.schema import config_hash, register, to_config
+
+register()
+logging.getLogger("tensorboard").setLevel(logging.ERROR)
+
+FILES = ("report.md", "table.csv", "runs.csv", "curves.csv", "curves.png", "curves.svg", "rates.png", "rates.svg")
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="report")
+@one_clear_error
+def main(cfg: DictConfig) -> None:
+    """One report."""
+    config: ReportConfig = to_config(cfg)
+    sweep = Path(config.sweep or "").expanduser()
+    runs, warnings = check_runs(find_runs(sweep, config_hash), incomplete=config.incomplete)
+    groups, bootstrap = Groups(runs), Bootstrap(config.resamples, config.confidence, config.seed)
+    reference = find_method(groups, config.reference, "reference")
+    against = find_method(groups, config.against, "against")
+    rows = compute_rows(groups, bootstrap, reference)
+    # event files take about half a second each
+    with tqdm(total=sum(run.learned for run in runs), unit="run", disable=None) as bar:
+
+        def read(run: Run) -> dict:
+            bar.update()
+            return read_curves(run)
+
+        curves, unlogged = compute_curves(groups, bootstrap, read)
+    warnings += unlogged
+    report = Report(groups, rows, reference, against)
+
+    target = sweep / "report"
+    # a report that fails leaves the old one
+    with tempfile.TemporaryDirectory(prefix=".report_", dir=sweep) as temporary:
+        folder = Path(temporary)
+        figures = save_figures(groups, rows, curves, report.compared, folder)
+        write_rows(folder / "table.csv", rows)
+        write_runs(folder / "runs.csv", runs)
+        write_curves(folder / "curves.csv", curves)
+        text = report.markdown(sweep.resolve().name, warnings, bootstrap, figures)
+        (folder / "report.md").write_text(text, encoding="utf-8")
+        target.mkdir(exist_ok=True)
+        for name in FILES:
+            if (folder / name).exists():
+                (folder / name).replace(target / name)
+            else:
+                (target / name).unlink(missing_ok=True)
+    tqdm.write("".join(f"warning: {line}\n" for line in warnings) + str(target / "report.md"))
+
+
+if __name__ == "__main__":
+    main()
