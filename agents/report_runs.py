@@ -20,7 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 # Overrides that belong to the world or to no method: they do not name one.
 UNNAMED = {"seed", "env", "device", "resume", "debug", "compile", "checkpoint", "eval", "hydra", "experiment", "method"}
-UNNAMED_EVALUATION = UNNAMED | {"controller", "steps", "num_envs", "pictures", "restart"}
+UNNAMED_EVALUATION = UNNAMED | {"controller", "folder", "steps", "num_envs", "pictures", "restart"}
 SHOWN = 3  # names per problem in an error: messages have at most 8 lines
 
 
@@ -103,7 +103,7 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
         seed=config.seed,
         learned=learned,
         config_hash=config_hash(config),
-        env=dict(config.env),
+        env=OmegaConf.to_container(config.env),
         protocol=f"{steps} steps{restart}",
         n_agents=config.env.n_agents,
         others=sorted(path.parent.relative_to(sweep).as_posix() for path in folder.glob("eval/*/eval.json")),

@@ -8,6 +8,7 @@ Source: Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Sta
 bootstrap, probability of improvement).
 """
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -15,9 +16,11 @@ import numpy as np
 from scipy import stats
 
 from agents.report_runs import Run
-from envs import keys
+from envs import SurveillanceConfig, keys
+from envs.centroidal import centroidal_cost
 
 ALL = "all worlds"
+BOUND = "unlimited batteries"
 COST = "eval.coverage_cost"
 RATES = ("intervention", "hold", "homing")
 BATCH = 2_000_000  # resampled numbers in memory at a time
@@ -62,6 +65,12 @@ def ratio(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
     own, reference = samples[: len(samples) // 2], samples[len(samples) // 2 :]
     scaled = [x / np.expand_dims(iqm(y, axis), axis) for x, y in zip(own, reference, strict=True)]
     return iqm(np.concatenate(scaled, axis=axis), axis)
+
+
+def gap_closed(bound: float, own: np.ndarray, reference: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Share of the gap between the reference's IQM of J and a lower bound that a method's closes; samples ``(*B, n_seeds)``."""
+    start = iqm(reference, axis)
+    return (start - iqm(own, axis)) / (start - bound)
 
 
 def improvement(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -134,6 +143,13 @@ class Groups:
         names = sorted({method for _, method in self.runs})
         return [name for name in names if all((world, name) in self.runs for world in worlds)]
 
+    def config(self, world: str) -> SurveillanceConfig:
+        """The world's configuration, as its first run has it."""
+        env = self.runs[world, self.methods(world)[0]][0].env
+        return SurveillanceConfig(
+            **{name: env[name] for name in SurveillanceConfig.__dataclass_fields__ if name in env}
+        )
+
     def sample(self, world: str, method: str, quantity: str) -> np.ndarray:
         """``(n_seeds,)``; NaN where a run did not measure ``quantity``."""
         return np.array([run.numbers.get(quantity, np.nan) for run in self.runs[world, method]], dtype=float)
@@ -153,9 +169,12 @@ def compute_rows(groups: Groups, bootstrap: Bootstrap, reference: str | None) ->
 
     Returns:
         Per world, and for :data:`ALL` where there are several: J's IQM, mean, standard deviation and ratio; rates;
-        violations summed over the seeds; P(J_x < J_y) of every learned method x over every other method y.
+        violations summed over the seeds; P(J_x < J_y) of every learned method x over every other method y. Per world:
+        the centroidal Voronoi cost, as J of :data:`BOUND`, and with a reference the share of the gap to it that is closed.
     """
     rows: list[Row] = []
+    bounds = {world: centroidal_cost(groups.config(world)) for world in groups.worlds}
+    rows += [Row(world, BOUND, "coverage_cost.bound", "", 0, j) for world, j in bounds.items() if j is not None]
     for world in groups.worlds:
         for method in groups.methods(world):
             rows += _own_rows(groups, bootstrap, world, method)
@@ -171,6 +190,8 @@ def compute_rows(groups: Groups, bootstrap: Bootstrap, reference: str | None) ->
 
             if reference in methods and method != reference:
                 compare("coverage_cost.ratio", ratio, reference)
+                if world != ALL and bounds.get(world) is not None:
+                    compare("gap_closed", functools.partial(gap_closed, bounds[world]), reference)
             if method in groups.learned:
                 for other in (name for name in methods if name != method):
                     compare("probability_of_improvement", improvement, other)

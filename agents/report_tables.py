@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from agents.report_runs import ReportError, Run
-from agents.report_statistics import ALL, RATES, Bootstrap, Curve, Groups, Row
+from agents.report_statistics import ALL, BOUND, RATES, Bootstrap, Curve, Groups, Row
 from envs import keys
 
 DASH = "–"
@@ -22,6 +22,8 @@ EXPLANATION = """## How to read this
   resampled on its own; {dash} for fewer than two seeds. For few seeds such intervals are too narrow.
 * ratio: IQM of J over that of the reference. In "{all}" each world's J is divided by the reference's first; the intervals
   are stratified over the worlds.
+* gap closed: (J of the reference - J) / (J of the reference - centroidal Voronoi cost), of IQMs. The centroidal Voronoi cost
+  is that of robots that stand at the best places and never charge: the best of several descents of Lloyd's algorithm.
 * P(better): probability that a run of the method has a lower J than a run of the other, ties half; 0.5 is no difference.
 * charges: charging trips per robot in the evaluation. intervention: share of robot-steps whose action the filter changed;
   in the first table during training for learned methods, in testing for controllers. hold, homing: share of robot-steps
@@ -144,7 +146,9 @@ class Report:
         return self._value(world, method, f"{'train' if method in self.groups.learned else 'eval'}.{name}_rate.mean")
 
     def _coverage(self, world: str, methods: list[str]) -> str:
+        bound = self.rows.get((world, BOUND, "coverage_cost.bound", ""))
         shown = [f"ratio to {self.reference}"] if self.reference else []
+        shown += ["gap closed"] if self.reference and bound else []
         header = ["method", "seeds", "IQM of J", "mean", "std", *shown, "charges", "intervention"]
         rows = [
             [
@@ -153,12 +157,19 @@ class Report:
                 estimate(self.rows[world, name, "coverage_cost.iqm", ""]),
                 *(self._value(world, name, f"coverage_cost.{key}") for key in ("mean", "std")),
                 *([self._ratio(world, name)] if self.reference else []),
+                *([self._gap(world, name)] if self.reference and bound else []),
                 self._value(world, name, "charges_per_robot.mean"),
                 self._rate(world, name, "intervention"),
             ]
             for name in methods
         ]
-        return table(header, rows)
+        text = f"\nCentroidal Voronoi cost, robots with unlimited batteries: J = {bound.value:.4g}.\n" if bound else ""
+        return table(header, rows) + text
+
+    def _gap(self, world: str, method: str) -> str:
+        if method == self.reference:
+            return "0 (reference)"
+        return estimate(self.rows.get((world, method, "gap_closed", self.reference or "")))
 
     def _aggregate(self, methods: list[str]) -> str:
         if self.reference not in methods:

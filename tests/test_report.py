@@ -16,9 +16,21 @@ import evaluate
 import report
 import train
 from agents.report_runs import ReportError, Run, check_runs, find_runs, read_curves
-from agents.report_statistics import ALL, Bootstrap, Groups, compute_curves, compute_rows, improvement, iqm, ratio
+from agents.report_statistics import (
+    ALL,
+    BOUND,
+    Bootstrap,
+    Groups,
+    compute_curves,
+    compute_rows,
+    improvement,
+    iqm,
+    ratio,
+)
 from agents.report_tables import find_method, number
 from conf.report_schema import ReportConfig
+from envs import SurveillanceConfig
+from envs.centroidal import centroidal_cost
 
 KINDS = ("depleted", "stranded", "overcharged", "collision")
 FILTER = {"intervention_rate": 0.5, "fallback_rate": 0.03, "homing_rate": 0.01, "infeasible": 2, "outside": 1}
@@ -178,6 +190,11 @@ def test_numbers_by_hand(program, sweep):
     assert float(rows["default", "agent=ddpg", "coverage_cost.std", ""]["value"]) == pytest.approx(expected)
     cbf = "coverage_cbf + certified"
     assert float(rows["default", "agent=ddpg", "coverage_cost.ratio", cbf]["value"]) == 2.25
+    bound = centroidal_cost(SurveillanceConfig(horizon=20))
+    assert float(rows["default", BOUND, "coverage_cost.bound", ""]["value"]) == bound
+    gap = rows["default", "agent=ddpg", "gap_closed", cbf]
+    assert float(gap["value"]) == pytest.approx((2.0 - 4.5) / (2.0 - bound))
+    assert float(gap["low"]) < float(gap["value"]) < float(gap["high"])
     pairs = (1 + 0.5) / 8  # J of 1 is below 2, J of 2 ties
     assert float(rows["default", "agent=ddpg", "probability_of_improvement", cbf]["value"]) == pairs
     assert float(rows["default", "safety=none", "probability_of_improvement", cbf]["value"]) == 7 / 8
@@ -197,7 +214,8 @@ def test_numbers_by_hand(program, sweep):
     text = (sweep / "report" / "report.md").read_text()
     assert "| agent=ddpg | 8 | 4.5 [" in text
     assert "| 2.25 [" in text
-    assert "1 (reference)" in text
+    assert "1 (reference) | 0 (reference)" in text
+    assert f"unlimited batteries: J = {bound:.4g}." in text
     assert "| safety=none | testing | 480 | 0 | 0 | 0 | 16 |" in text
     assert "P(better than safety=none)" in text
     order = [text.index(f"| {name} | 8 |") for name in ("safety=none", cbf, "agent=ddpg")]
@@ -453,7 +471,7 @@ def test_a_run_without_a_finite_cost_is_told_and_not_averaged_away(tmp_path):
         (["agent=ddpg"], {"method": "dalal"}, "default", "dalal"),
         (["agent=ddpg"], {"method": "default"}, "default", "agent=ddpg"),
         (
-            ["controller=ou", "safety.alpha_s=2", "restart=true"],
+            ["controller=ou", "safety.alpha_s=2", "restart=true", "folder=elsewhere"],
             {"controller": "ou"},
             "default",
             "ou + certified safety.alpha_s=2",
