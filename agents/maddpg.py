@@ -12,6 +12,7 @@ Source: Lowe et al., Multi-agent actor-critic for mixed cooperative-competitive 
 Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 1509.02971.
 """
 
+import functools
 import math
 
 import torch
@@ -76,17 +77,17 @@ class MADDPGLoss(DDPGLoss):
             state_action_value=STATE_ACTION_VALUE, reward=keys.REWARD, done=keys.DONE, terminated=keys.TERMINATED
         )
         self.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
-        # Optimisers and soft update write into these tensors, so that the lists stay current.
+
+    @functools.cached_property
+    def layers(self) -> dict[str, Layers]:
+        """Weights and biases by network; optimisers, soft update and ``load_state_dict`` write into these tensors."""
         actor, value = ("module", "0", "module", "net", "params"), ("module", "1", "module", "net", "params")
-        self._actor, self._target_actor, self._value, self._target_value = (
-            layers_of(params[path])
-            for params, path in (
-                (self.actor_network_params, actor),
-                (self.target_actor_network_params, actor),
-                (self.value_network_params, value),
-                (self.target_value_network_params, value),
-            )
-        )
+        return {
+            "actor": layers_of(self.actor_network_params[actor]),
+            "target_actor": layers_of(self.target_actor_network_params[actor]),
+            "value": layers_of(self.value_network_params[value]),
+            "target_value": layers_of(self.target_value_network_params[value]),
+        }
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Losses of a minibatch.
@@ -101,17 +102,17 @@ class MADDPGLoss(DDPGLoss):
         action = tensordict[keys.ACTION]
         if self.nominal:
             action = limit_speed(tensordict[keys.NOMINAL_ACTION], self.max_speed)
-        value = self.evaluate(self._value, observation, action, action)
+        value = self.evaluate(self.layers["value"], observation, action, action)
         with torch.no_grad():
-            next_action, _ = self.act(self._target_actor, following)
-            future = self.evaluate(self._target_value, following[keys.OBSERVATION], next_action, next_action)
+            next_action, _ = self.act(self.layers["target_actor"], following)
+            future = self.evaluate(self.layers["target_value"], following[keys.OBSERVATION], next_action, next_action)
             steps = tensordict.get(STEPS, None)
             discount = self.agent.gamma if steps is None else self.agent.gamma ** steps.squeeze(-1)
             reward, terminated = (following[key].squeeze(-1) for key in (keys.REWARD, keys.TERMINATED))
             target = reward + torch.where(terminated, 0.0, discount * future)
-        own, correction = self.act(self._actor, tensordict)
+        own, correction = self.act(self.layers["actor"], tensordict)
         others = action if self.agent.gradient == "per_agent" else own
-        fixed = [(weight.detach(), bias.detach()) for weight, bias in self._value]
+        fixed = [(weight.detach(), bias.detach()) for weight, bias in self.layers["value"]]
         loss_actor = -self.evaluate(fixed, observation, own, others)
         if self.agent.correction_penalty:
             loss_actor = loss_actor + self.agent.correction_penalty * (correction / self.max_speed).square()

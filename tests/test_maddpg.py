@@ -1,10 +1,12 @@
 """The MADDPG update against networks and formulas written out here, robot by robot, on batches from the environment."""
 
+import copy
 import itertools
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.objectives import DDPGLoss
 
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
@@ -138,6 +140,35 @@ def test_shared_gradient_recomputes_all_actions():
     action = s.act(actor, s.batch[keys.OBSERVATION])
     expected = torch.stack([-s.value(critic, i, s.batch[keys.OBSERVATION], action) for i in range(N)], 1)
     torch.testing.assert_close(s.loss(s.batch)["loss_actor"], expected)
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_shared_gradient_is_torchrls_loss(share):
+    """After updates, a load and a copy as well: the losses read the parameters that are in force."""
+    s, other = (
+        Setup(gradient="shared", share_params=share),
+        Setup(gradient="shared", share_params=share, critic_cells=[8, 6]),
+    )
+
+    def agree(loss):
+        mine, theirs = loss(s.batch), DDPGLoss.forward(loss, s.batch.clone())
+        for name in ("loss_value", "pred_value", "target_value"):
+            torch.testing.assert_close(mine[name], theirs[name].squeeze(-1) if theirs[name].dim() > 2 else theirs[name])
+        actor = DDPGLoss.loss_actor(loss, s.batch.clone())[0]
+        torch.testing.assert_close(mine["loss_actor"], actor)
+        return mine["loss_value"]
+
+    first, optimizers = agree(s.loss), make_optimizers(s.loss, s.agent)
+    for _ in range(3):
+        update_step(s.batch, s.loss, optimizers, s.updater, s.agent)
+    second = agree(s.loss)
+    assert not torch.allclose(first, second)
+    other.loss.load_state_dict(s.loss.state_dict())
+    torch.testing.assert_close(agree(other.loss), second)
+    twin = copy.deepcopy(s.loss)
+    update_step(s.batch, s.loss, optimizers, s.updater, s.agent)
+    torch.testing.assert_close(agree(twin), second)
+    assert not torch.allclose(agree(s.loss), second)
 
 
 def test_losses_reach_their_own_networks_only():
