@@ -34,15 +34,15 @@ format: venv
 bench: venv
 	@for name in qp filter env_step update; do $(BIN)/python tests/benchmarks/bench_$$name.py --seconds 5 $(ARGS) || exit 1; done
 
-# The whole table, or a part: make benchmark ENVS=default SEEDS='range(3)' METHODS=certified,ddpg. Goes on where it was stopped.
+# The whole table, or a part: make benchmark ENVS=default SEEDS='range(3)' METHODS=certified,ddpg DEVICE=device=cpu. Goes on where it
+# was stopped.
 ENVS ?= default,five_robots,random_density,moving_density
 SEEDS ?= range(10)
-METHODS ?= certified,certified_executed,in_loss,in_loss_penalty,separate,ddpg,stacked_filter,paper_filter,dalal,unfiltered,violation_penalty
 CONTROLLERS ?= coverage_cbf,lloyd,charge_when_low,random
 FOLDER ?= runs/benchmark
-SET = env=$(ENVS) 'seed=$(SEEDS)' num_envs=256 pictures=false resume=auto folder=$(FOLDER)/controllers
+SET = env=$(ENVS) 'seed=$(SEEDS)' num_envs=256 pictures=false resume=auto folder=$(FOLDER)/controllers $(DEVICE)
 benchmark: venv
-	$(BIN)/python train.py -m experiment=benchmark env=$(ENVS) 'seed=$(SEEDS)' method=$(METHODS) hydra.sweep.dir=$(FOLDER) $(ARGS)
+	$(BIN)/python train.py -m experiment=benchmark env=$(ENVS) 'seed=$(SEEDS)' $(if $(METHODS),method=$(METHODS)) hydra.sweep.dir=$(FOLDER) $(DEVICE) $(ARGS)
 	$(BIN)/python evaluate.py -m controller=$(CONTROLLERS) $(SET)
 	$(BIN)/python evaluate.py -m controller=coverage_cbf_literal safety=paper env.on_violation=continue $(SET)
 	$(BIN)/python report.py sweep=$(FOLDER)

@@ -76,9 +76,9 @@ def main(cfg: DictConfig) -> None:
     def evaluate() -> dict:
         eval_env.set_seed(eval_seed)  # the same start states every time
         steps = config.eval.steps or rollout_steps(config.env.horizon)
-        metrics, _, _ = evaluate_policy(eval_env, policy, steps, check=check)
+        metrics, statistics, _ = evaluate_policy(eval_env, policy, steps, check=check)
         log(evaluation_scalars(metrics))
-        return metrics
+        return metrics | {"filter": statistics}
 
     def checkpoint() -> None:
         content = {
@@ -117,7 +117,7 @@ def main(cfg: DictConfig) -> None:
         updated = time.perf_counter()
         if log_due(recorder.frames):
             scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
-            scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # as stored: the objective's
+            scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # the objective's
             numbers = {name: float(value) for name, value in losses.items()}
             check_finite(numbers, recorder.frames)
             log(scalars | {f"loss/{name}": value for name, value in numbers.items()})

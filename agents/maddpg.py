@@ -89,6 +89,10 @@ class MADDPGLoss(DDPGLoss):
             "target_value": layers_of(self.target_value_network_params[value]),
         }
 
+    def __getstate__(self) -> dict:
+        """A copy finds its own layers."""
+        return {name: value for name, value in super().__getstate__().items() if name != "layers"}
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Losses of a minibatch.
 
@@ -189,7 +193,7 @@ def make_optimizers(loss: MADDPGLoss, agent: AgentConfig) -> dict[str, torch.opt
 
 
 def reduce_robots(loss: Tensor, agent: AgentConfig) -> Tensor:
-    """Mean over the minibatch, sum over the robots (each has its own parameters), ``(batch, N) -> ()``.
+    """Mean over the minibatch, sum over the robots, ``(batch, N) -> ()``.
 
     With ``minibatch=per_agent`` the batch is N consecutive minibatches and robot i counts in the i-th only.
     """

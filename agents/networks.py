@@ -22,7 +22,23 @@ class BatchedMLP(MultiAgentMLP):
     """``MultiAgentMLP`` evaluated as batched matrix products, with its own or other layers.
 
     Same parameters and same results as its ``vmap``, at a fraction of the time for networks of this size.
+
+    Args:
+        n_in: size of a robot's input.
+        n_out: size of its output.
+        n_agents: number of robots.
+        cells: hidden units (ReLU), layer by layer.
+        share_params: one network for all robots.
     """
+
+    def __init__(self, n_in: int, n_out: int, n_agents: int, cells: list[int], *, share_params: bool) -> None:
+        super().__init__(
+            *(n_in, n_out, n_agents),
+            centralized=False,  # a robot's row already holds all that it sees
+            share_params=share_params,
+            num_cells=cells,
+            activation_class=nn.ReLU,
+        )
 
     def forward(self, x: Tensor, layers: Layers | None = None) -> Tensor:
         """``(*B, N, n_in) -> (*B, N, n_out)``; ``layers`` take the place of the own ones."""
@@ -35,7 +51,7 @@ class BatchedMLP(MultiAgentMLP):
         x = x.reshape(-1, *x.shape[-2:]).transpose(0, 1)
         for k, (weight, bias) in enumerate(layers):
             x = torch.baddbmm(bias.unsqueeze(1), x if k == 0 else torch.relu(x), weight.mT)
-        return x.transpose(0, 1).reshape(*batch, *x.shape[:1], -1)
+        return x.transpose(0, 1).reshape(*batch, x.shape[0], x.shape[-1])
 
 
 def layers_of(params: TensorDictBase) -> Layers:
@@ -58,13 +74,7 @@ class BallActor(nn.Module):
         super().__init__()
         self.max_speed = world.max_speed
         self.net = BatchedMLP(
-            n_observation,
-            world.dimension,
-            world.n_agents,
-            centralized=False,
-            share_params=agent.share_params,
-            num_cells=list(agent.actor_cells),
-            activation_class=nn.ReLU,
+            *(n_observation, world.dimension, world.n_agents, list(agent.actor_cells)), share_params=agent.share_params
         ).to(world.torch_dtype)
         # Small last layers: the first policies move slowly instead of at a random full speed (DDPG, section 7).
         last = str(2 * len(agent.actor_cells))
@@ -98,13 +108,8 @@ class Critic(nn.Module):
         self.centralized = agent.algorithm == "maddpg"
         seen = world.n_agents if self.centralized else 1
         self.net = BatchedMLP(
-            seen * (n_observation + world.dimension),
-            1,
-            world.n_agents,
-            centralized=False,  # the input is already joint: a robot's row holds its own joint action
+            *(seen * (n_observation + world.dimension), 1, world.n_agents, list(agent.critic_cells)),
             share_params=agent.share_params,
-            num_cells=list(agent.critic_cells),
-            activation_class=nn.ReLU,
         ).to(world.torch_dtype)
         with torch.no_grad():
             self.net.params[str(2 * len(agent.critic_cells))]["bias"].add_(agent.initial_reward / (1 - agent.gamma))

@@ -1,11 +1,12 @@
 """Construction of the training pipeline: environment, collector and replay buffer."""
 
+from typing import cast
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs.transforms import MultiStepTransform
 
 from agents.adversary_reward import AdversaryReward
 from envs import SurveillanceEnv, keys
@@ -81,8 +82,8 @@ def to_transitions(
 class MultiStep:
     """Turns collected steps into transitions over ``n_steps`` steps, fewer where an episode ends on the way.
 
-    The reward becomes the discounted sum, "next" (flags included) the last step's; "steps_to_next_obs" tells the target how
-    far that is. The newest ``n_steps`` steps of every world wait for the following call.
+    The reward becomes the discounted sum, "next" with its flags the last step's; "steps_to_next_obs" tells the target how
+    far that is. The newest ``n_steps - 1`` steps of every world wait for the following call.
 
     Args:
         n_steps: 1 passes the transitions through as they are.
@@ -90,14 +91,29 @@ class MultiStep:
     """
 
     def __init__(self, n_steps: int, gamma: float) -> None:
-        self.transform = MultiStepTransform(n_steps, gamma, reward_keys=[keys.REWARD]) if n_steps > 1 else None
+        self.n_steps, self.gamma = n_steps, gamma
+        self.waiting: TensorDictBase | None = None
 
     def __call__(self, transitions: TensorDictBase) -> TensorDictBase:
         """``(num_envs, T) -> (num_envs * T,)``, less than that at the start."""
-        if self.transform is None:
+        if self.n_steps == 1:
             return transitions.reshape(-1)
-        merged = self.transform.inv(transitions)
-        if merged is None:
+        window = transitions
+        if self.waiting is not None:
+            window = cast(TensorDictBase, torch.cat([self.waiting, transitions], dim=1))  # pyright: ignore[reportArgumentType]
+        self.waiting = window[:, max(0, window.shape[1] - self.n_steps + 1) :].clone()
+        length = window.shape[1] - self.n_steps + 1
+        if length <= 0:
             return transitions.reshape(-1)[:0]
-        steps = merged[STEPS][..., None, None].expand_as(merged["next"][keys.REWARD])  # as the target wants it
-        return merged.select(*STORED).set(STEPS, steps).reshape(-1)
+        following = window["next"]
+        reward, done = following[keys.REWARD], following["done"].squeeze(-1)
+        total, goes_on = reward[:, :length], ~done[:, :length]
+        last = torch.arange(length, device=done.device).repeat(len(window), 1)
+        for k in range(1, self.n_steps):
+            later = slice(k, k + length)
+            total = total + torch.where(goes_on[..., None, None], self.gamma**k * reward[:, later], 0.0)
+            last = last + goes_on
+            goes_on = goes_on & ~done[:, later]
+        steps = (last - torch.arange(length, device=done.device) + 1).to(total.dtype)
+        merged = window[:, :length].exclude("next").set(STEPS, steps[..., None, None].expand_as(total))
+        return merged.set("next", following.gather(1, last).set(keys.REWARD, total)).reshape(-1)

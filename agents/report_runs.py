@@ -98,7 +98,7 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
     run = Run(
         folder=folder,
         name=folder.relative_to(sweep).as_posix(),
-        world=" ".join([choices.env, *sorted(entry[4:] for entry in overrides if entry.startswith("env."))]),
+        world=" ".join([choices.env, *sorted(entry[4:] for entry in overrides if _names_world(entry))]),
         method=_method(config, choices, overrides),
         seed=config.seed,
         learned=learned,
@@ -123,12 +123,17 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
 def _method(config: DictConfig, choices: DictConfig, overrides: list[str]) -> str:
     """Name of what is compared: the choice of group ``method``, a controller and its filter, or the overrides."""
     if choices.get("method", "default") != "default":
-        return choices.method
+        return " ".join([choices.method, *_named(overrides, UNNAMED)])
     if config.get("controller") is not None:
         own = [entry for entry in overrides if not entry.startswith("safety=")]
         return " ".join([f"{config.controller} + {choices.safety}", *_named(own, UNNAMED_EVALUATION)])
     experiment = [choices.experiment] if any(entry.startswith("experiment=") for entry in overrides) else []
     return " ".join([*experiment, *_named(overrides, UNNAMED)]) or choices.experiment
+
+
+def _names_world(override: str) -> bool:
+    """What happens after a violation is a matter of the method, which may set it itself."""
+    return override.startswith("env.") and not override.startswith("env.on_violation=")
 
 
 def _named(overrides: list[str], unnamed: set[str]) -> list[str]:

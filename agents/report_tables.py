@@ -26,8 +26,8 @@ EXPLANATION = """## How to read this
   is that of robots that stand at the best places and never charge: the best of several descents of Lloyd's algorithm.
 * P(better): probability that a run of the method has a lower J than a run of the other, ties half; 0.5 is no difference.
 * charges: charging trips per robot in the evaluation. intervention: share of robot-steps whose action the filter changed;
-  in the first table during training for learned methods, in testing for controllers. hold, homing: share of robot-steps
-  that the shield held or drove home. All are means over the seeds.
+  exploration noise included in training. hold, homing: share of robot-steps that the shield held or drove home. All are means
+  over the seeds.
 * Violations, infeasible (QPs) and outside (states that the filter does not vouch for) are robot-steps, summed over the
   seeds. Training counts exploration too; testing is the evaluation.
 """
@@ -142,14 +142,11 @@ class Report:
             return "1 (reference)"
         return estimate(self.rows.get((world, method, "coverage_cost.ratio", self.reference or "")))
 
-    def _rate(self, world: str, method: str, name: str) -> str:
-        return self._value(world, method, f"{'train' if method in self.groups.learned else 'eval'}.{name}_rate.mean")
-
     def _coverage(self, world: str, methods: list[str]) -> str:
         bound = self.rows.get((world, BOUND, "coverage_cost.bound", ""))
         shown = [f"ratio to {self.reference}"] if self.reference else []
         shown += ["gap closed"] if self.reference and bound else []
-        header = ["method", "seeds", "IQM of J", "mean", "std", *shown, "charges", "intervention"]
+        header = ["method", "seeds", "IQM of J", "mean", "std", *shown, "charges", "intervention, training", "testing"]
         rows = [
             [
                 name,
@@ -159,7 +156,7 @@ class Report:
                 *([self._ratio(world, name)] if self.reference else []),
                 *([self._gap(world, name)] if self.reference and bound else []),
                 self._value(world, name, "charges_per_robot.mean"),
-                self._rate(world, name, "intervention"),
+                *(self._value(world, name, f"{phase}.intervention_rate.mean") for phase in ("train", "eval")),
             ]
             for name in methods
         ]

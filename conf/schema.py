@@ -167,6 +167,13 @@ class Config:
         check_choice("resume", self.resume, ("auto", "never"))
         self.safety.gains(self.env)
         check_loss(self.agent, self.safety)
+        steps = self.collector.total_frames // self.collector.num_envs
+        if steps < self.agent.n_steps:
+            raise ValueError(
+                f"agent.n_steps={self.agent.n_steps} is longer than the run, which would learn nothing: "
+                f"collector.total_frames={self.collector.total_frames} with collector.num_envs={self.collector.num_envs} are "
+                f"{steps} steps of every world."
+            )
         self.adversary_reward()
 
     def adversary_reward(self) -> AdversaryReward | None:

@@ -1,4 +1,4 @@
-"""Coverage with unlimited batteries: the centroidal Voronoi cost, below which no policy's mean cost can stay for long."""
+"""Coverage with unlimited batteries: an estimate of the centroidal Voronoi cost, below which no policy stays for long."""
 
 import torch
 
@@ -9,7 +9,7 @@ from envs.density import Density
 STARTS, SWEEPS = 16, 100  # descents per density, and their length
 
 
-def centroidal_cost(config: SurveillanceConfig, densities: int = 64, seed: int = 0) -> float | None:
+def centroidal_cost(config: SurveillanceConfig, densities: int = 256, seed: int = 0) -> float | None:
     """Least coverage cost of robots that never charge and may stand anywhere, mean over the world's densities.
 
     The best of several descents of Lloyd's algorithm from random positions: an estimate from above of the minimum of a
@@ -17,7 +17,7 @@ def centroidal_cost(config: SurveillanceConfig, densities: int = 64, seed: int =
 
     Args:
         config: the world.
-        densities: densities drawn where they vary.
+        densities: densities drawn where they vary; the standard error of 256 is 0.8 % with env=random_density.
         seed: of densities and positions.
 
     Returns:

@@ -1,9 +1,13 @@
 """Motion of the robots: single integrator, exact under a zero-order hold, with a Euclidean speed limit."""
 
 import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
 
 TINY_SQUARE = 1e-37  # below it a squared length is 0
 
@@ -38,21 +42,26 @@ def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
     return position + dt * velocity
 
 
-@functools.lru_cache(maxsize=64)
+def constant(make: Callable[..., T]) -> Callable[..., T]:
+    """Decorate a function of hashable arguments that returns tensors: made once, and fit for autograd whoever asks first."""
+    return functools.lru_cache(maxsize=64)(torch.inference_mode(False)(make))
+
+
+@constant
 def other_indices(n_agents: int, device: torch.device | None = None) -> Tensor:
     """Row i holds the other robots in cyclic order, ``i + 1, i + 2, ..``: ``(N, N - 1)`` int64."""
     robots = torch.arange(n_agents, device=device)
     return (robots.unsqueeze(-1) + robots[1:]) % n_agents
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def pair_indices(n_agents: int, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Indices ``(i, j)``, ``i < j``, of all pairs of robots, each ``(P,)`` with ``P = N (N - 1) / 2``."""
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j
 
 
-@functools.lru_cache(maxsize=64)
+@constant
 def own_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Robot i's pairs, others in cyclic order, and its side in them (0 in pair (i, j), 1 in (j, i)): ``(N, N - 1)`` each."""
     i, j = pair_indices(n_agents, device)

@@ -6,7 +6,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from envs.dynamics import pair_indices
+from envs.dynamics import constant, pair_indices
 
 POLYGON_FACES = 16  # 2-D: a regular polygon
 POLYHEDRON_FACES = 64  # 3-D: a polyhedron with spiral face normals
@@ -32,7 +32,7 @@ def speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float
     return normals.tolist(), radius * math.cos(widest)
 
 
-@lru_cache(maxsize=64)
+@constant
 def face_normals(dimension: int, radius: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
     """:func:`speed_faces` with the normals as a tensor ``(F, d)``, made once."""
     normals, offset = speed_faces(dimension, radius)

@@ -14,7 +14,7 @@ from conf.schema import Config, config_hash, to_config
 CONF = Path(__file__).parents[1] / "conf"
 GROUPS = [
     (group, path.stem)
-    for group in ("env", "safety", "agent", "train", "experiment")
+    for group in ("env", "safety", "agent", "train", "experiment", "method")
     for path in (CONF / group).glob("*.yaml")
 ]
 
@@ -44,6 +44,50 @@ def test_every_field_of_the_schema_can_be_set_from_the_command_line():
         text = "null" if value is None else str(value).replace(" ", "").replace("'", "")
         overrides.append(f"{name}={text}")
     assert to_config(composed(*overrides)) == Config()
+
+
+def test_paper_run_is_the_papers_algorithm():
+    agent = to_config(composed("experiment=paper")).agent
+    assert (agent.critic_action, agent.n_steps, agent.noise, agent.gamma) == ("executed", 1, "gaussian", 0.95)
+    assert not agent.share_params
+    assert (agent.gradient, agent.correction_penalty) == ("per_agent", 0.0)
+
+
+def test_methods_are_different_runs_and_say_what_they_are():
+    names = [path.stem for path in (CONF / "method").glob("*.yaml")]
+    composed_methods = {name: composed(f"method={name}") for name in names}
+    hashes = {name: config_hash(cfg) for name, cfg in composed_methods.items()}
+    assert hashes["default"] == hashes["certified"]
+    assert len(set(hashes.values())) == len(names) - 1
+    assert all(config_hash(composed(f"method={name}", "seed=3")) == hashes[name] for name in names)
+    configs = {name: to_config(cfg) for name, cfg in composed_methods.items()}
+    modes = {name: config.safety.mode for name, config in configs.items() if config.safety.mode != "certified"}
+    assert modes == {
+        "stacked_filter": "paper",
+        "paper_filter": "paper",
+        "dalal": "dalal",
+        "unfiltered": "none",
+        "violation_penalty": "none",
+    }
+    assert all((config.env.on_violation == "continue") == (name in modes) for name, config in configs.items())
+    assert configs["ddpg"].agent == dataclasses.replace(configs["certified"].agent, algorithm="ddpg")
+    assert configs["separate"].agent == AgentConfig()
+    assert configs["violation_penalty"].train.violation_penalty > 0
+    benchmark = (CONF / "experiment" / "benchmark.yaml").read_text()
+    assert set(benchmark.split("method: ")[-1].split()[0].split(",")) == set(names) - {"default"}
+
+
+def test_a_run_shorter_than_its_targets_is_refused():
+    with pytest.raises(ValueError, match=r"agent\.n_steps=5 is longer than the run.*4 steps of every world"):
+        to_config(composed("collector.total_frames=1000"))
+    to_config(composed("collector.total_frames=1250"))
+
+
+def test_methods_compose_with_experiments_and_give_way_to_the_command_line():
+    config = to_config(composed("experiment=paper", "method=ddpg"))
+    assert (config.agent.algorithm, config.agent.n_steps) == ("ddpg", 1)
+    assert to_config(composed("method=unfiltered", "env.on_violation=terminate")).env.on_violation == "terminate"
+    assert to_config(composed("method=paper_filter", "safety=none")).safety.mode == "none"
 
 
 def test_paper_run_is_the_papers_budget():

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.dynamics import integrate, limit_speed, pair_indices
+from envs.dynamics import integrate, limit_speed, other_indices, pair_indices
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -92,3 +92,14 @@ def test_integrator_is_exact_under_a_held_input(d):
 def test_pairs_come_in_the_order_of_combinations(n):
     i, j = pair_indices(n)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == list(combinations(range(n), 2))
+
+
+def test_constants_made_in_inference_mode_serve_autograd():
+    for make in (other_indices, pair_indices):
+        make.cache_clear()
+        with torch.inference_mode():
+            index = make(3)
+        index = index if isinstance(index, torch.Tensor) else index[0]
+        x = torch.ones(3, requires_grad=True)
+        (x[index] * 2).sum().backward()
+        assert x.grad is not None

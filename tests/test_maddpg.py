@@ -6,7 +6,7 @@ import itertools
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.objectives import DDPGLoss
+from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
@@ -168,7 +168,12 @@ def test_shared_gradient_is_torchrls_loss(share):
     twin = copy.deepcopy(s.loss)
     update_step(s.batch, s.loss, optimizers, s.updater, s.agent)
     torch.testing.assert_close(agree(twin), second)
-    assert not torch.allclose(agree(s.loss), second)
+    third = agree(s.loss)
+    assert not torch.allclose(third, second)
+    update_step(s.batch, twin, make_optimizers(twin, s.agent), SoftUpdate(twin, tau=s.agent.tau), s.agent)
+    moved = twin(s.batch)["loss_value"]  # TorchRL's own losses do not follow a copy
+    assert not torch.allclose(moved, second)
+    torch.testing.assert_close(agree(s.loss), third)
 
 
 def test_losses_reach_their_own_networks_only():
@@ -463,12 +468,12 @@ def test_n_step_transitions_and_targets():
     multi_step, parts = MultiStep(n, gamma), []
     for first, last in ((0, 2), (2, 3), (3, 9), (9, steps)):  # batches of any length
         parts.append(multi_step(rollout[:, first:last]))
-    assert [len(p) > 0 for p in parts] == [False, False, True, True]
-    merged = torch.cat(parts[2:])
-    assert len(merged) == worlds * (steps - n)
+    assert [len(p) // worlds for p in parts] == [0, 1, 6, steps - 9]
+    merged = torch.cat(parts[1:])
+    assert len(merged) == worlds * (steps - n + 1)
     by_position = {tuple(row[keys.POSITION].flatten().tolist()): row for row in merged}
     loss, _ = make_loss(actor, critic, agent, SafetyConfig(), world)
-    for b, t in itertools.product(range(worlds), range(steps - n)):
+    for b, t in itertools.product(range(worlds), range(steps - n + 1)):
         row = by_position[tuple(rollout[b, t][keys.POSITION].flatten().tolist())]
         last = min([t + n - 1] + [e for e in ends if e >= t])
         assert (row["steps_to_next_obs"] == last - t + 1).all()
@@ -497,8 +502,37 @@ def test_n_step_transition_ends_with_a_violation():
     for key in (("next", "done"), NEXT_DONE, NEXT_TERMINATED):
         rollout[key] = flag if key == ("next", "done") else flag.unsqueeze(-1).expand(1, 6, N, 1).clone()
     merged = MultiStep(3, 0.5)(rollout)
-    assert merged["next"][keys.REWARD][:, 0, 0].tolist() == [1 + 5.0, 10.0, 100 + 500 + 2500]
-    assert merged[NEXT_TERMINATED][:, 0, 0].tolist() == [True, True, False]
+    assert merged["next"][keys.REWARD][:, 0, 0].tolist() == [1 + 5.0, 10.0, 100 + 500 + 2500, 1000 + 5e3 + 2.5e4]
+    assert merged[NEXT_TERMINATED][:, 0, 0].tolist() == [True, True, False, False]
+    assert merged["next", "done"].flatten().tolist() == [True, True, False, False]
+
+
+def test_n_steps_survive_any_stream():
+    """Random ends, batch lengths, discounts 0 and 1 - included: against a loop over worlds and steps."""
+    generator = torch.Generator().manual_seed(0)
+    s = Setup()
+    for n, gamma, share in ((2, 0.5, 0.3), (5, 0.9, 0.0), (7, 0.0, 0.1), (4, 1.0, 1.0)):
+        rollout = s.batch.reshape(8, 10).clone()
+        reward = torch.randn(8, 10, N, 1, dtype=torch.float64, generator=generator)
+        done = torch.rand(8, 10, 1, generator=generator) < share
+        rollout["next"][keys.REWARD], rollout["next", "done"] = reward, done
+        multi_step = MultiStep(n, gamma)
+        merged = torch.cat(
+            [part for k in (0, 1, 4, 9) if len(part := multi_step(rollout[:, k : {0: 1, 1: 4, 4: 9, 9: 10}[k]]))]
+        )
+        assert len(merged) == 8 * (10 - n + 1)
+        found = {row[keys.OBSERVATION].sum().item(): row for row in merged}
+        for b, t in itertools.product(range(8), range(10 - n + 1)):
+            total, last = 0.0, t
+            for k in range(n):
+                last = t + k
+                total = total + gamma**k * reward[b, last]
+                if done[b, last]:
+                    break
+            row = found[rollout[b, t][keys.OBSERVATION].sum().item()]
+            torch.testing.assert_close(row["next"][keys.REWARD], total)
+            assert torch.equal(row["next"][keys.OBSERVATION], rollout["next"][keys.OBSERVATION][b, last])
+            assert (row["steps_to_next_obs"] == last - t + 1).all()
 
 
 def test_one_step_passes_through():

@@ -106,10 +106,10 @@ def test_joint_action_replaces_the_own_entry_only_and_puts_it_first(d):
 @SHARED
 def test_networks_are_torchrls(share):
     inputs = randn(B, 3, N_OBS)
-    net = BatchedMLP(N_OBS, 2, 3, centralized=False, share_params=share, num_cells=[7, 5], activation_class=nn.ReLU)
+    net = BatchedMLP(N_OBS, 2, 3, [7, 5], share_params=share)
     twin = MultiAgentMLP(N_OBS, 2, 3, centralized=False, share_params=share, num_cells=[7, 5], activation_class=nn.ReLU)
     twin.load_state_dict(net.state_dict())
-    for x in (inputs, inputs[0], inputs.reshape(1, B, 3, N_OBS)):
+    for x in (inputs, inputs[0], inputs[:0], inputs.reshape(1, B, 3, N_OBS)):
         torch.testing.assert_close(net(x), twin(x), rtol=1e-5, atol=1e-6)
     gradients = [torch.autograd.grad(n(inputs).square().sum(), list(n.parameters())) for n in (net, twin)]
     for a, b in zip(*gradients, strict=True):

@@ -468,7 +468,14 @@ def test_a_run_without_a_finite_cost_is_told_and_not_averaged_away(tmp_path):
         (["env=ring", "hydra.launcher.n_jobs=2"], {"world": "ring"}, "ring", "default"),
         (["env.n_agents=5"], {}, "default n_agents=5", "default"),
         (["experiment=smoke", "+agent.gamma=0.9"], {"experiment": "smoke"}, "default", "smoke agent.gamma=0.9"),
-        (["agent=ddpg"], {"method": "dalal"}, "default", "dalal"),
+        (["env=default"], {"method": "dalal"}, "default", "dalal"),
+        (["safety=none"], {"method": "dalal"}, "default", "dalal safety=none"),
+        (
+            ["env.on_violation=continue"],
+            {"controller": "coverage_cbf_literal"},
+            "default",
+            "coverage_cbf_literal + certified",
+        ),
         (["agent=ddpg"], {"method": "default"}, "default", "agent=ddpg"),
         (
             ["controller=ou", "safety.alpha_s=2", "restart=true", "folder=elsewhere"],
