@@ -46,6 +46,12 @@ def main(cfg: DictConfig) -> None:
         tqdm.write(message)
         return
     set_aside(folder)
+    origin = {
+        "config_hash": config_hash(cfg),
+        "git_hash": git_hash(),
+        "versions": package_versions(),
+        "seed": config.seed,
+    }
 
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     start, device = time.perf_counter(), pick_device(config.device)
@@ -142,12 +148,6 @@ def main(cfg: DictConfig) -> None:
     curves = {name: np.array(values) for name, values in recorder.episodes.finished.items()}
     save_training_curve(curves, folder / "figures" / "training.png")
     wall_time = time.perf_counter() - start
-    origin = {
-        "config_hash": config_hash(cfg),
-        "git_hash": git_hash(),
-        "versions": package_versions(),
-        "seed": config.seed,
-    }
     speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds}
     write_json(folder / "summary.json", origin | recorder.summary() | speed | {"eval": metrics})
     writer.close()

@@ -1,5 +1,6 @@
 """Where a run came from: package versions and the commit."""
 
+import functools
 import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
@@ -19,6 +20,7 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
+@functools.cache  # a program that runs several jobs keeps the code it started with
 def git_hash() -> str:
     """Commit of the source tree, with ``-dirty`` if it has changes; ``unknown`` outside a repository."""
     try:

@@ -14,9 +14,10 @@ to transitions of random actions. The layer solves ``min ||a - a^||^2`` under th
 then clamps the current to [0, 1] and cuts the velocity to the speed ball. A baseline without a promise: the model errs,
 one constraint is served at a time, the cuts come after, and the others move.
 
-Two additions to the source, which has neither: the drift ``b`` (a battery drains whatever its robot does; without
-``b``, ``safety.dalal_drift=false``, the fit puts the drain into ``g``) and a floor of ``g^T g``, because a constraint
-that the action does not reach (overcharge, away from the stations) must not win the argmax by a division by zero.
+Three additions to the source's model: the margin (``safety.dalal_margin`` steps); the drift ``b`` (a battery drains
+whatever its robot does; without ``b``, ``safety.dalal_drift=false``, the fit puts the drain into ``g``); and a floor of
+``g^T g``, because a constraint that the action does not reach (overcharge, away from the stations) must not win the
+argmax by a division by zero (below the floor the correction falls short of its constraint).
 
 Source: Dalal et al., Safe exploration in continuous action spaces, arXiv 1801.08757.
 """
