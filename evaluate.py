@@ -24,7 +24,7 @@ from agents.checkpoint import find_checkpoint, load_checkpoint
 from agents.evaluation import evaluate_policy
 from agents.incident import check_violations
 from agents.networks import make_actor
-from agents.pipeline import pick_device
+from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
 from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config
@@ -43,6 +43,7 @@ def main(cfg: DictConfig) -> None:
     """One evaluation."""
     config: EvaluateConfig = to_config(cfg)
     device = pick_device(config.device)
+    use_threads(config.threads)
     folder = Path(HydraConfig.get().runtime.output_dir)
     env_seed, controller_seed = np.random.SeedSequence(config.seed).generate_state(2).tolist()
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))

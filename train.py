@@ -23,7 +23,7 @@ from agents.evaluation import evaluate_policy, evaluation_scalars
 from agents.incident import check_violations
 from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
-from agents.pipeline import MultiStep, make_buffer, make_collector, pick_device, to_transitions
+from agents.pipeline import MultiStep, make_buffer, make_collector, pick_device, to_transitions, use_threads
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
 from conf.run_folder import announce_certificate, finished_run, write_json
@@ -55,6 +55,7 @@ def main(cfg: DictConfig) -> None:
 
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     start, device = time.perf_counter(), pick_device(config.device)
+    use_threads(config.threads)
     env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
     torch.manual_seed(config.seed)
     env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed, compile=config.compile)

@@ -31,6 +31,12 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def use_threads(threads: int) -> None:
+    """Compute on this many CPU threads; 0 leaves PyTorch's choice."""
+    if threads:
+        torch.set_num_threads(threads)
+
+
 def make_collector(
     env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, total_frames: int
 ) -> Collector:

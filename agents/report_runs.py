@@ -19,7 +19,20 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 # Overrides that belong to the world or to no method: they do not name one.
-UNNAMED = {"seed", "env", "device", "resume", "debug", "compile", "checkpoint", "eval", "hydra", "experiment", "method"}
+UNNAMED = {
+    "seed",
+    "env",
+    "device",
+    "threads",
+    "resume",
+    "debug",
+    "compile",
+    "checkpoint",
+    "eval",
+    "hydra",
+    "experiment",
+    "method",
+}
 UNNAMED_EVALUATION = UNNAMED | {"controller", "folder", "steps", "num_envs", "pictures", "restart"}
 SHOWN = 3  # names per problem in an error: messages have at most 8 lines
 

@@ -120,7 +120,9 @@ class Bootstrap:
             batch=max(1, BATCH // sum(sample.size for sample in samples)),
             rng=np.random.default_rng(self.seed),
         )
-        return Estimate(value, *result.confidence_interval)
+        low, high = result.confidence_interval
+        known = low < high  # resamples that are all the same say nothing: P(better) of two methods that never overlap
+        return Estimate(value, np.where(known, low, np.nan), np.where(known, high, np.nan))
 
 
 class Groups:
@@ -183,6 +185,8 @@ def compute_rows(groups: Groups, bootstrap: Bootstrap, reference: str | None) ->
         for method in methods:
             x = groups.samples(world, method)
             seeds = min(sample.size for sample in x)
+            if any(sample.size != seeds for sample in x):
+                continue  # worlds with more seeds would count for more
 
             def compare(quantity, statistic, other, method=method, x=x, seeds=seeds, world=world) -> None:
                 found = bootstrap(statistic, *x, *groups.samples(world, other))
