@@ -120,9 +120,7 @@ class Bootstrap:
             batch=max(1, BATCH // sum(sample.size for sample in samples)),
             rng=np.random.default_rng(self.seed),
         )
-        low, high = result.confidence_interval
-        known = low < high  # resamples that are all the same say nothing: P(better) of two methods that never overlap
-        return Estimate(value, np.where(known, low, np.nan), np.where(known, high, np.nan))
+        return Estimate(value, *result.confidence_interval)
 
 
 class Groups:

@@ -19,8 +19,8 @@ EXPLANATION = """## How to read this
 * J: coverage cost, m², mean over worlds and steps of the evaluation; lower is better. IQM: interquartile mean over the seeds
   (their mean for fewer than four). The seeds are the only replications.
 * Brackets: {confidence:g} % percentile bootstrap intervals over the seeds ({resamples} resamples), each method and world
-  resampled on its own; {dash} for fewer than two seeds, and where all resamples give the same. For few seeds such intervals
-  are too narrow. "{all}" needs as many seeds of a method in every world.
+  resampled on its own; {dash} for fewer than two seeds. For few seeds such intervals are too narrow, down to one
+  point (P(better) of methods that never overlap). "{all}" needs as many seeds of a method in every world.
 * ratio: IQM of J over that of the reference. In "{all}" each world's J is divided by the reference's first; the intervals
   are stratified over the worlds.
 * gap closed: (J of the reference - J) / (J of the reference - centroidal Voronoi cost), of IQMs. The centroidal Voronoi cost
