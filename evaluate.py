@@ -21,13 +21,13 @@ from tqdm import tqdm
 
 from agents import make_controller
 from agents.checkpoint import find_checkpoint, load_checkpoint
-from agents.evaluation import evaluate_policy
+from agents.evaluation import evaluate_policy, rollout_steps
 from agents.incident import check_violations
 from agents.networks import make_actor
 from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
-from conf.schema import Config, EvaluateConfig, register, rollout_steps, run_config, to_config
+from conf.schema import Config, EvaluateConfig, register, run_config, to_config
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.rendering import save_battery_plot, save_gif, save_snapshots

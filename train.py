@@ -19,7 +19,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from agents.checkpoint import keep_newest, save_checkpoint, set_aside, world_sizes
-from agents.evaluation import evaluate_policy, evaluation_scalars
+from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import check_violations
 from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
@@ -27,7 +27,7 @@ from agents.pipeline import MultiStep, make_buffer, make_collector, pick_device,
 from agents.recorder import Every, TrainingRecorder
 from conf.callbacks import one_clear_error
 from conf.run_folder import announce_certificate, finished_run, write_json
-from conf.schema import Config, config_hash, register, rollout_steps, to_config
+from conf.schema import Config, config_hash, register, to_config
 from conf.versions import git_hash, package_versions
 from envs import SurveillanceEnv, keys
 from envs.rendering import save_training_curve

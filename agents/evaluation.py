@@ -18,6 +18,11 @@ from safety.statistics import FilterStatistics
 RECORD_LIMIT = 2000  # samples of the recorded world; longer rollouts keep every n-th
 
 
+def rollout_steps(horizon: int) -> int:
+    """Length of an evaluation that gives none: one episode, or 1000 steps where episodes do not end."""
+    return horizon or 1000
+
+
 @torch.no_grad()
 def evaluate_policy(
     env: SurveillanceEnv,

@@ -114,12 +114,12 @@ class MultiStep:
         following = window["next"]
         reward, done = following[keys.REWARD], following["done"].squeeze(-1)
         total, goes_on = reward[:, :length], ~done[:, :length]
-        last = torch.arange(length, device=done.device).repeat(len(window), 1)
+        ahead = torch.zeros_like(goes_on, dtype=torch.int64)  # of the last step of each transition
         for k in range(1, self.n_steps):
             later = slice(k, k + length)
             total = total + torch.where(goes_on[..., None, None], self.gamma**k * reward[:, later], 0.0)
-            last = last + goes_on
+            ahead = ahead + goes_on
             goes_on = goes_on & ~done[:, later]
-        steps = (last - torch.arange(length, device=done.device) + 1).to(total.dtype)
-        merged = window[:, :length].exclude("next").set(STEPS, steps[..., None, None].expand_as(total))
-        return merged.set("next", following.gather(1, last).set(keys.REWARD, total)).reshape(-1)
+        last = following.gather(1, torch.arange(length, device=done.device) + ahead).set(keys.REWARD, total)
+        steps = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
+        return window[:, :length].exclude("next").set(STEPS, steps).set("next", last).reshape(-1)

@@ -18,6 +18,8 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from agents.evaluation import rollout_steps
+
 # Overrides that belong to the world or to no method: they do not name one.
 UNNAMED = {
     "seed",
@@ -106,7 +108,7 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
         return None
     hydra = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra
     choices, overrides = hydra.runtime.choices, [str(entry).lstrip("+~") for entry in hydra.overrides.task]
-    steps = (config.eval.steps if learned else config.steps) or config.env.horizon or 1000  # conf.schema.rollout_steps
+    steps = (config.eval.steps if learned else config.steps) or rollout_steps(config.env.horizon)
     restart = ", worlds drawn anew after a violation" if config.get("restart") else ""
     run = Run(
         folder=folder,

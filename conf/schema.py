@@ -13,6 +13,7 @@ from agents import AgentConfig, make_controller
 from agents.adversary_reward import BARRIERS, AdversaryReward
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
 from agents.controllers import CONTROLLERS
+from agents.evaluation import rollout_steps
 from agents.maddpg import check_loss
 from agents.pipeline import pick_device
 from conf.report_schema import ReportConfig
@@ -337,8 +338,3 @@ def evaluation_folder(cfg: DictConfig) -> str:
         return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
     folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
     return str(Path(cfg.folder).absolute() / folder)
-
-
-def rollout_steps(horizon: int) -> int:
-    """Length of an evaluation that gives none: one episode, or 1000 steps where episodes do not end."""
-    return horizon or 1000

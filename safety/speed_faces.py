@@ -1,7 +1,6 @@
 """Rows for solvers that know no ball: a polytope inscribed in the speed ball, and the joint problem of all robots."""
 
 import math
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -12,7 +11,6 @@ POLYGON_FACES = 16  # 2-D: a regular polygon
 POLYHEDRON_FACES = 64  # 3-D: a polyhedron with spiral face normals
 
 
-@lru_cache
 def speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float]:
     """Face normals and offset of a polytope inscribed in the speed ball.
 
