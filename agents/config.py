@@ -26,6 +26,12 @@ class AgentConfig:
     (the filter is a part of the environment). executed: those after it (the paper); the critics then know nothing of
     actions that the filter would change, and may draw the actors there. auto: executed with safety.in_loss=true, which
     needs it, else nominal."""
+    critic_state: str = "own"
+    """State that critic i sees: own (robot i's observation, which holds all places and batteries) | concatenated (all
+    observations, the paper)."""
+    foresight: int = 5
+    """Critics also see the batteries and the coverage cost that this many steps of the actions would lead to, by the
+    world's model, 0..1000 (0: the paper)."""
     gamma: float = 0.99
     """Discount per step, [0, 1)."""
     n_steps: int = 5
@@ -43,10 +49,13 @@ class AgentConfig:
     """Exploration noise, added before the filter: gaussian | ou (Ornstein-Uhlenbeck)."""
     noise_initial: float = 1.0
     """Standard deviation of the noise at the start, share of max_speed, [0, 10]."""
-    noise_final: float = 0.1
+    noise_final: float = 1.0
     """Standard deviation of the noise at the end of the annealing, share of max_speed, [0, 10]."""
     noise_frames: int = 600_000
-    """World-steps over which the noise falls linearly, >= 0 (0 = noise_final from the start)."""
+    """World-steps over which the noise goes linearly to noise_final, >= 0 (0 = noise_final from the start)."""
+    noise_spread: float = 1.0
+    """The parallel worlds' noise is spread evenly from (1 - noise_spread) times these standard deviations up to them,
+    [0, 1] (0: the same in all worlds, the paper)."""
     ou_theta: float = 0.05
     """ou: mean reversion per step, (0, 1]; 1/theta steps go by before the noise points elsewhere."""
     max_grad_norm: float = 0.0
@@ -71,6 +80,9 @@ class AgentConfig:
         check_choice("agent.critic_action", self.critic_action, ("auto", "nominal", "executed"))
         check_range("agent.n_steps", self.n_steps, 1, 1000)
         check_range("agent.initial_reward", self.initial_reward, -1e6, 1e6)
+        check_choice("agent.critic_state", self.critic_state, ("own", "concatenated"))
+        check_range("agent.foresight", self.foresight, 0, 1000)
+        check_range("agent.noise_spread", self.noise_spread, 0, 1)
         check_choice("agent.gradient", self.gradient, ("per_agent", "shared"))
         check_choice("agent.minibatch", self.minibatch, ("shared", "per_agent"))
         check_choice("agent.noise", self.noise, ("gaussian", "ou"))

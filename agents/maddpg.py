@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from agents.config import AgentConfig
-from agents.networks import STATE_ACTION_VALUE, Layers, joint_action, layers_of
+from agents.networks import STATE_ACTION_VALUE, Layers, layers_of
 from agents.pipeline import STEPS
 from envs import SurveillanceConfig, keys
 from envs.dynamics import limit_speed
@@ -142,8 +142,7 @@ class MADDPGLoss(DDPGLoss):
     def evaluate(self, layers: Layers, observation: Tensor, own: Tensor, others: Tensor) -> Tensor:
         """``Q_i(s, own_i, others)`` of the critics with these layers, ``(batch, N)``."""
         critic = self.value_network[-1].module  # pyright: ignore[reportIndexIssue]
-        joint = joint_action(own, others, centralized=critic.centralized)
-        return critic(observation, joint, layers).squeeze(-1)
+        return critic.values(observation, own, others, layers).squeeze(-1)
 
 
 def check_loss(agent: AgentConfig, safety: SafetyConfig) -> None:

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torchrl.modules import MultiAgentMLP
 
 from agents.config import AgentConfig
+from agents.foresight import Foresight
 from envs import SurveillanceConfig, keys
 from envs.dynamics import other_indices
 from safety import SafetyConfig, SafetyFilter
@@ -92,32 +93,62 @@ class BallActor(nn.Module):
 class Critic(nn.Module):
     """Action values of all robots: ``Q_i(s, a_1..a_N)``, or ``Q_i(o_i, a_i)`` for independent learners.
 
-    The state ``s`` is the concatenation of all observations. Row i lists robot i first, then i+1, i+2, .. (cyclic, as
-    the observation does), in state and joint action (see :func:`joint_action`), so that one network may serve all
-    robots. Actions enter in units of ``max_speed``. The value starts at ``initial_reward / (1 - gamma)``.
+    The state ``s`` of critic i is robot i's own observation, which holds all places and batteries, or the concatenation
+    of all observations (``agent.critic_state``), and what :class:`Foresight` tells of the actions, unless
+    ``agent.foresight`` is 0. Row i lists robot i first, then i+1, i+2, .. (cyclic, as the observation does), in state and
+    joint action (see :func:`joint_action`), so that one network may serve all robots. Actions enter in units of
+    ``max_speed``. The value starts at ``initial_reward / (1 - gamma)``.
 
     Args:
         n_observation: size of a robot's observation.
         world: number of robots, dimension, speed.
-        agent: algorithm, layers and sharing.
+        agent: algorithm, state, layers and sharing.
     """
 
     def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> None:
         super().__init__()
-        self.max_speed = world.max_speed
+        self.world = world
         self.centralized = agent.algorithm == "maddpg"
-        seen = world.n_agents if self.centralized else 1
-        self.net = BatchedMLP(
-            *(seen * (n_observation + world.dimension), 1, world.n_agents, list(agent.critic_cells)),
-            share_params=agent.share_params,
-        ).to(world.torch_dtype)
+        self.concatenated = self.centralized and agent.critic_state == "concatenated"
+        self.foresight = Foresight(world, agent.foresight) if agent.foresight else None
+        n = world.n_agents
+        n_in = (n if self.concatenated else 1) * n_observation + (n if self.centralized else 1) * world.dimension
+        n_in += self.foresight.n_features if self.foresight else 0
+        self.net = BatchedMLP(n_in, 1, n, list(agent.critic_cells), share_params=agent.share_params).to(
+            world.torch_dtype
+        )
         with torch.no_grad():
             self.net.params[str(2 * len(agent.critic_cells))]["bias"].add_(agent.initial_reward / (1 - agent.gamma))
 
-    def forward(self, observation: Tensor, joint: Tensor, layers: Layers | None = None) -> Tensor:
-        """``(*B, N, n_obs), (*B, N, k) -> (*B, N, 1)``; ``layers`` as :class:`BatchedMLP`'s."""
-        state = joint_action(observation, observation, centralized=self.centralized)
-        return self.net(torch.cat([state, joint / self.max_speed], dim=-1), layers)
+    def forward(self, observation: Tensor, joint: Tensor) -> Tensor:
+        """``(*B, N, n_obs), (*B, N, k) -> (*B, N, 1)``, the joint action being :func:`joint_action`'s."""
+        d, n = self.world.dimension, self.world.n_agents
+        own = others = joint[..., :d]
+        if self.centralized and n > 1:
+            others = joint[..., d : 2 * d].roll(1, dims=-2)  # robot i comes second in the row of robot i-1
+        return self.values(observation, own, others)
+
+    def values(self, observation: Tensor, own: Tensor, others: Tensor, layers: Layers | None = None) -> Tensor:
+        """Action values.
+
+        Args:
+            observation: ``(*B, N, n_obs)``.
+            own: ``(*B, N, d)``, actions through which row i's gradient flows, m/s.
+            others: ``(*B, N, d)``, actions of the other robots, m/s; independent critics do not look at them.
+            layers: as :class:`BatchedMLP`'s.
+
+        Returns:
+            ``(*B, N, 1)``.
+        """
+        joint = joint_action(own, others, centralized=self.centralized)
+        features = [
+            joint_action(observation, observation, centralized=self.concatenated),
+            joint / self.world.max_speed,
+        ]
+        if self.foresight:
+            known = others if self.centralized else torch.zeros_like(own)  # whose action one does not know, stays
+            features.append(self.foresight(observation, own, known))
+        return self.net(torch.cat(features, dim=-1), layers)
 
 
 def joint_action(own: Tensor, others: Tensor, *, centralized: bool) -> Tensor:
@@ -141,7 +172,8 @@ class ExplorationNoise(TensorDictModuleBase):
     """Adds exploration noise to the nominal action, before the filter; restarted at each episode, annealed in frames.
 
     Gaussian: ``sigma xi``. Ornstein-Uhlenbeck: ``n+ = (1 - theta) n + sigma sqrt(1 - (1 - theta)^2) xi``, so that sigma
-    is its stationary standard deviation too.
+    is its stationary standard deviation too. With ``agent.noise_spread`` every world has a size of its own (as the actors
+    of Horgan et al., Distributed prioritized experience replay, arXiv 1803.00933).
 
     Args:
         agent: kind, size and annealing.
@@ -179,9 +211,16 @@ class ExplorationNoise(TensorDictModuleBase):
             if self.process is not None and self.process.shape == action.shape:
                 noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, self.process)
             self.process = noise
-        tensordict.set(keys.NOMINAL_ACTION, action + self.sigma * self.max_speed * noise)
+        size = self.sigma * self.max_speed * self.spread(action)
+        tensordict.set(keys.NOMINAL_ACTION, action + size * noise)
         self.frames += step.numel()
         return tensordict
+
+    def spread(self, action: Tensor) -> Tensor:
+        """Share of sigma for each world, evenly over ``[1 - noise_spread, 1]``, ``(*B, 1, 1)``."""
+        worlds = action.shape[0]
+        rank = torch.arange(1, worlds + 1, dtype=action.dtype, device=action.device) / worlds
+        return (1 - self.agent.noise_spread * (1 - rank)).reshape(-1, *[1] * (action.dim() - 1))
 
     def get_extra_state(self) -> dict:
         """Generator, annealing and process, for checkpoints."""

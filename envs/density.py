@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from envs.config import SurveillanceConfig
-from envs.coverage import quadrature_points
+from envs.coverage import quadrature_points, squared_distances
 
 AGE_CELLS = 4  # the age field is observed as the mean over a 4^d partition of the arena
 
@@ -95,9 +95,8 @@ class Density:
 
     def _gaussian_weights(self, centers: Tensor) -> Tensor:
         """Weights under equal Gaussians around ``centers (*B, K, d)``, ``(*B, Q)``."""
-        offset = self.points.unsqueeze(-2) - centers.unsqueeze(-3)
-        exponent = offset.square().sum(-1) * (-0.5 / self.config.density_sigma**2)
-        return exponent.logsumexp(-1).softmax(-1)  # finite also where every component underflows
+        exponent = squared_distances(centers, self.points) * (-0.5 / self.config.density_sigma**2)
+        return exponent.logsumexp(-2).softmax(-1)  # finite also where every component underflows
 
     def observe(self, params: Tensor) -> Tensor:
         """What a robot may know of a density that varies, ``(B, n_observed)``, of order one."""
@@ -107,6 +106,22 @@ class Density:
             return params[..., :0]
         middle = self.bounds.mean(-1)
         return ((self.component_centers(params) - middle) / self.config.length_scale).flatten(-2)
+
+    def reference_cost(self) -> float:
+        """J_ref, the unit of the reward: J with every robot in its slot under the uniform density, whatever the family, m^2."""
+        docked = self.points.new_tensor(self.config.slot_positions)[: self.config.n_agents]
+        _, cell_moment = quadrature_points(self.config.bounds, self.config.quadrature_resolution)
+        return float(squared_distances(docked, self.points).amin(dim=-2).mean()) + cell_moment
+
+    def weights_seen(self, observed: Tensor) -> Tensor:
+        """Weights as far as :meth:`observe` tells: of the same centres; the ages of coarse cells. ``(Q,)`` or ``(*B, Q)``."""
+        if self._cells is not None:
+            importance = observed @ (self._cells > 0).to(observed.dtype).T * self.config.age_limit + self.config.dt
+            return importance / importance.sum(-1, keepdim=True)
+        if self.n_observed == 0:
+            return self.weights(observed)
+        middle = self.bounds.mean(-1)
+        return self._gaussian_weights(observed.unflatten(-1, self.centers.shape) * self.config.length_scale + middle)
 
     def _partition(self) -> Tensor:
         """Averaging matrix ``(Q, AGE_CELLS^d)`` from points to the coarse cells."""

@@ -15,10 +15,11 @@ from torchrl.envs import EnvBase
 from envs import keys
 from envs.compilation import compiled
 from envs.config import SurveillanceConfig
-from envs.coverage import quadrature_points, squared_distances, voronoi_moments, weighted_sum
+from envs.coverage import squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
-from envs.dynamics import components_first, limit_speed, other_indices
+from envs.dynamics import components_first, limit_speed
 from envs.metrics import violations
+from envs.observation import observation_fields, observe
 from envs.reassignment import reassign_slots
 from envs.starts import draw_starts
 from envs.transition import transition
@@ -30,22 +31,7 @@ CHUNK_DISTANCES = 2**20
 class SurveillanceEnv(EnvBase):
     """``num_envs`` independent worlds of ``config``, stepped in parallel.
 
-    Writes the keys of :mod:`envs.keys`. The observation of robot i, in this order (lengths in units of half the
-    arena's longest side ``L``, relative vectors as *other minus own*):
-
-    ========================  ==================  ==============================================================
-    field                     size                meaning
-    ========================  ==================  ==============================================================
-    position                  d                   own position relative to the arena's middle, / L
-    energy                    1                   (E - E_min) / (E_max - E_min)
-    slot                      d                   vector to the own charging slot, / L
-    stations                  M d                 vectors to all stations, / L
-    others' positions         (N - 1) d           vectors to robots i+1, i+2, .. (cyclic), / L
-    others' energies          N - 1               as energy, same order
-    density                   n_observed          parameters of a density that varies (centres / L, or coarse ages)
-    time                      1 if horizon > 0    share of the episode that has passed, at most 1
-    centroid                  d, only on request  vector to the centroid of the own Voronoi cell, / L
-    ========================  ==================  ==============================================================
+    Writes the keys of :mod:`envs.keys`; :mod:`envs.observation` lists what a robot observes.
 
     Args:
         config: the world; a dataclass that has already validated itself.
@@ -81,12 +67,7 @@ class SurveillanceEnv(EnvBase):
         self.bounds = torch.tensor(config.bounds, **factory)
         self._transition = compiled(functools.partial(transition, config=config), enabled=compile)
         self._violations = compiled(functools.partial(violations, config=config), enabled=compile)
-        self._others = other_indices(config.n_agents, device)
-        docked = self.slots[: config.n_agents]
-        # J_ref is J under the uniform density whatever the family, so it takes the uniform density's cell moment
-        _, cell_moment = quadrature_points(config.bounds, config.quadrature_resolution)
-        nearest = squared_distances(docked, self.density.points).amin(dim=-2)
-        self.reference_cost = float(nearest.mean()) + cell_moment
+        self.reference_cost = self.density.reference_cost()
         self.generator = torch.Generator(device=device)
         self._make_specs()
         self._set_seed(seed)
@@ -268,28 +249,10 @@ class SurveillanceEnv(EnvBase):
         return TensorDict(out, self.batch_size, device=self.device)
 
     def _observe(self, params: Tensor, centroid: Tensor | None) -> Tensor:
-        c, state = self.config, self._state
-        position: Tensor = state["position"]
-        length = c.length_scale
-        slot_position: Tensor = self.slots[state["slot"]]
-        share = (state["energy"] - c.energy_min) / (c.energy_max - c.energy_min)
-        relative = position[:, self._others] - position.unsqueeze(-2)  # (B, N, N-1, d)
-        fields = [
-            (position - self.bounds.mean(-1)) / length,
-            share.unsqueeze(-1),
-            (slot_position - position) / length,
-            torch.flatten(self.stations - position.unsqueeze(-2), -2) / length,
-            torch.flatten(relative, -2) / length,
-            share[:, self._others],
-        ]
-        if self.density.n_observed:
-            fields.append(self.density.observe(params).unsqueeze(-2).expand(*self._robots, -1))
-        if c.horizon:
-            time = (state["step"].to(share.dtype) / c.horizon).clamp_max(1)
-            fields.append(time.unsqueeze(-2).expand(*self._robots, 1))
-        if centroid is not None:
-            fields.append((centroid - position) / length)
-        return torch.cat(fields, dim=-1)
+        state = self._state
+        seen, middle = self.density.observe(params), self.bounds.mean(-1)
+        own = (state["position"], state["energy"], self.slots[state["slot"]], state["step"])
+        return observe(*own, centroid, seen, self.stations, middle, self.config)
 
     def _with_flags(self, out: TensorDict, terminated: Tensor, truncated: Tensor) -> TensorDict:
         flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
@@ -308,9 +271,7 @@ class SurveillanceEnv(EnvBase):
         def flag(*shape: int) -> Binary:
             return Binary(n=1, shape=(*self.batch_size, *shape), dtype=torch.bool, device=self.device)
 
-        n_observed = c.dimension * (2 + len(self.stations) + n - 1) + n + self.density.n_observed
-        n_observed += (c.horizon > 0) + c.dimension * c.observe_centroid
-        self.n_observation = n_observed
+        self.n_observation = list(observation_fields(c, self.density).values())[-1].stop
 
         def agents(**entries) -> Composite:
             return Composite(entries, shape=(b,), device=self.device)
@@ -318,7 +279,7 @@ class SurveillanceEnv(EnvBase):
         self.observation_spec = Composite(
             {
                 keys.AGENTS: agents(
-                    observation=unbounded(n, n_observed),
+                    observation=unbounded(n, self.n_observation),
                     position=unbounded(n, c.dimension),
                     energy=unbounded(n, 1),
                     slot=Categorical(n=len(self.slots), shape=(b, n, 1), dtype=torch.int64, device=self.device),

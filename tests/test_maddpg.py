@@ -18,6 +18,7 @@ from safety import SafetyConfig, SafetyFilter
 torch.set_num_threads(1)
 N, D = 3, 2
 SMALL = {"actor_cells": [8], "critic_cells": [8, 6], "critic_action": "executed", "gamma": 0.95, "initial_reward": 0.0}
+SMALL |= {"critic_state": "concatenated", "foresight": 0}
 NEXT_TERMINATED = ("next", *keys.TERMINATED)
 NEXT_DONE = ("next", *keys.DONE)
 

@@ -24,6 +24,7 @@ from safety import SafetyConfig, SafetyFilter
 
 torch.set_num_threads(1)
 N_OBS, B = 11, 5
+RAW = {"critic_state": "concatenated", "foresight": 0}  # observations of any size, all of them
 SHARED = pytest.mark.parametrize("share", [False, True])
 DIMENSIONS = pytest.mark.parametrize("d", [2, 3])
 
@@ -80,7 +81,7 @@ def test_robot_acts_on_its_own_observation_alone():
 
 
 def test_layers_and_type_follow_the_configuration():
-    agent = AgentConfig(actor_cells=[7, 5, 4], critic_cells=[9])
+    agent = AgentConfig(actor_cells=[7, 5, 4], critic_cells=[9], **RAW)
     world = world_of(dtype="float64")
     actor, critic = BallActor(N_OBS, world, agent), Critic(N_OBS, world, agent)
     shapes = sorted(tuple(p.shape) for p in actor.parameters() if p.ndim == 3)
@@ -117,15 +118,15 @@ def test_networks_are_torchrls(share):
 
 
 def test_values_start_at_the_expected_return():
-    agent = AgentConfig(initial_reward=-0.5, gamma=0.98)
-    plain, shifted = (seeded(Critic, N_OBS, world_of(), a) for a in (AgentConfig(initial_reward=0.0), agent))
+    agents = AgentConfig(initial_reward=0.0, **RAW), AgentConfig(initial_reward=-0.5, gamma=0.98, **RAW)
+    plain, shifted = (seeded(Critic, N_OBS, world_of(), agent) for agent in agents)
     observation, joint = randn(B, 3, N_OBS), randn(B, 3, 6)
     torch.testing.assert_close(shifted(observation, joint), plain(observation, joint) - 25.0)
 
 
 def critic_gradients(algorithm):
     """|dQ_i / d observation_j| and |dQ_i / d action_j|, two (3, 3) matrices."""
-    critic = seeded(make_critic, N_OBS, world_of(), AgentConfig(algorithm=algorithm))
+    critic = seeded(make_critic, N_OBS, world_of(), AgentConfig(algorithm=algorithm, **RAW))
     td = TensorDict({keys.OBSERVATION: randn(B, 3, N_OBS), keys.ACTION: 0.1 * randn(B, 3, 2, seed=1)}, [B])
     for key in (keys.OBSERVATION, keys.ACTION):
         td[key].requires_grad_()
@@ -151,7 +152,7 @@ def test_independent_critic_sees_itself_alone():
 
 
 def test_critic_reads_actions_in_units_of_the_speed_limit():
-    agent = AgentConfig()
+    agent = AgentConfig(**RAW)
     slow, fast = (seeded(make_critic, N_OBS, world_of(max_speed=v), agent) for v in (0.2, 0.1))
     observation, action = randn(B, 3, N_OBS), 0.1 * randn(B, 3, 2, seed=1)
     values = [
@@ -165,6 +166,7 @@ def test_critic_reads_actions_in_units_of_the_speed_limit():
 
 # ---- exploration noise -----------------------------------------------------------------------------------------------
 def noise_of(kind="gaussian", *, seed=0, initial=0.5, final=0.5, frames=100, **fields):
+    fields = {"noise_spread": 0.0} | fields
     agent = AgentConfig(noise=kind, noise_initial=initial, noise_final=final, noise_frames=frames, **fields)
     return ExplorationNoise(agent, world_of(max_speed=0.4, dt=0.1), seed)
 
@@ -187,6 +189,17 @@ def test_noise_has_its_own_generator(kind):
         assert torch.equal(x, y)
         assert not torch.equal(x, z)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "ou"])
+def test_noise_is_spread_over_the_worlds(kind):
+    """Evenly from (1 - spread) sigma, not included, up to sigma; a world alone gets all of it."""
+    noise = noise_of(kind, noise_spread=0.8)
+    samples = torch.stack([draw(noise, k, worlds=4) for k in range(3000)])
+    for world, share in enumerate((0.4, 0.6, 0.8, 1.0)):
+        assert samples[:, world].std().item() == pytest.approx(share * 0.5 * 0.4, rel=0.05)
+    alone, plain = noise_of(kind, noise_spread=1.0), noise_of(kind)
+    assert torch.equal(draw(alone, 0, worlds=1), draw(plain, 0, worlds=1))
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "ou"])
@@ -248,7 +261,7 @@ def test_noise_continues_from_its_state(kind):
 # ---- policies --------------------------------------------------------------------------------------------------------
 def policies(noise=3.0, **safety):
     world = SurveillanceConfig()
-    agent = AgentConfig(noise="gaussian", noise_initial=noise, noise_final=noise)
+    agent = AgentConfig(noise="gaussian", noise_initial=noise, noise_final=noise, noise_spread=0.0)
     env = SurveillanceEnv(world, 32, seed=0)
     actor = seeded(make_actor, env.n_observation, world, agent)
     policy, explore = make_policies(actor, world, SafetyConfig(**safety), agent, 0, torch.device("cpu"))
