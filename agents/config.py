@@ -17,7 +17,7 @@ class AgentConfig:
     """Hidden units of every critic, layer by layer, 1..4096 each."""
     share_params: bool = False
     """One actor and one critic for all robots instead of one each (true with the command line's agent=maddpg and ddpg)."""
-    actor_lr: float = 3e-4
+    actor_lr: float = 1e-3
     """Learning rate of the actors (Adam), (0, 1]."""
     critic_lr: float = 1e-3
     """Learning rate of the critics (Adam), (0, 1]."""
