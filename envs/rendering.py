@@ -268,10 +268,10 @@ def save_gif(trajectory: Trajectory, path: str | Path, *, max_frames: int = 150,
 
 @rc_context(STYLE)
 def save_battery_plot(trajectory: Trajectory, path: str | Path) -> Path:
-    """Plots energy over time per robot above a chart of everyone's charging intervals; returns the path."""
+    """Plots energy over time per robot, a chart of everyone's charging intervals and the coverage cost; returns the path."""
     (steps, n), dt, energy = trajectory.energy.shape, trajectory.dt, trajectory.energy
-    figure = Figure(figsize=(7.0, 3.6 + 0.19 * n), dpi=180, layout="constrained")
-    top, rows = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 0.35 + 0.19 * n))
+    figure = Figure(figsize=(7.0, 4.7 + 0.19 * n), dpi=180, layout="constrained")
+    top, rows, cost = figure.subplots(3, 1, sharex=True, height_ratios=(2.6, 0.35 + 0.19 * n, 1.0))
     for i in range(n):
         colour, marker, ink = _style(i)
         variant = (i + i // len(COLOURS)) % 4  # shifts by one per round, so that equal colours differ in style
@@ -288,7 +288,9 @@ def save_battery_plot(trajectory: Trajectory, path: str | Path) -> Path:
         top.axhline(level, color=INK, lw=1.0, ls=(0, (6, 3)), zorder=1)
         top.text(1.01, level, f"$E_{{\\{name}}}$ = {level:.3g}", va="center", transform=top.get_yaxis_transform())
     top.set(ylabel="battery energy E\n(battery units)")
-    rows.set(xlabel="time (s)", ylabel="charging\nrobot", xlim=(0.0, (steps - 1) * dt or 1.0), ylim=(n - 0.4, -0.6))
+    cost.plot(np.arange(steps) * dt, trajectory.coverage_cost, color=INK, lw=0.8)
+    cost.set(xlabel="time (s)", ylabel="coverage\ncost J (m²)")
+    rows.set(ylabel="charging\nrobot", xlim=(0.0, (steps - 1) * dt or 1.0), ylim=(n - 0.4, -0.6))
     rows.set_yticks(range(n), [str(i + 1) for i in range(n)])
     figure.align_ylabels()
     Path(path).parent.mkdir(parents=True, exist_ok=True)
