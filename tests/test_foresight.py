@@ -19,7 +19,7 @@ WORLDS = pytest.mark.parametrize(
         {},
         {"n_agents": 1},
         {"n_agents": 5, "density": "uniform"},
-        {"density_per_world": True},
+        {"density_per_world": True, "arena": [[0.5, 2.5], [1, 3]]},
         {"density": "moving"},
         {"density": "age", "horizon": 0},
         {"dimension": 3, "arena": [[-1, 1], [-1, 1], [0, 1]], "density": "uniform"},
@@ -30,14 +30,18 @@ WORLDS = pytest.mark.parametrize(
 
 
 def start(batch=6, seed=0, **fields):
-    """World, its start observations and random actions, float64."""
+    """World, observations of start states (one robot almost full in its charger) and random actions, float64."""
     config = SurveillanceConfig(dtype="float64", **fields)
     env = SurveillanceEnv(config, batch, seed=seed)
     td = env.reset()
+    position, energy = td[keys.POSITION].clone(), td[keys.ENERGY].clone()
+    position[0, 0], energy[0, 0] = env.slots[td[keys.SLOT][0, 0, 0]], config.energy_max - 1e-3
+    td = env.set_state(position, energy)
     generator = torch.Generator().manual_seed(seed)
     actions = [
         config.max_speed * torch.randn(td[keys.POSITION].shape, generator=generator, dtype=torch.float64) for _ in "ab"
     ]
+    actions[0][0, 0] = 0  # it stays there
     return config, env, td, *actions
 
 
