@@ -32,7 +32,7 @@ class Foresight(nn.Module):
     def __init__(self, world: SurveillanceConfig, steps: int) -> None:
         super().__init__()
         self.world, self.steps = world, steps
-        self._on: dict[torch.device, tuple[Density, Tensor, float]] = {}
+        self._on: dict[torch.device, tuple[Density, Tensor, float, dict[str, slice]]] = {}
 
     @property
     def n_features(self) -> int:
@@ -51,9 +51,8 @@ class Foresight(nn.Module):
             ``(*B, N, N + 1)``: batteries, own first, then in the observation's order, as shares, and the coverage cost in
             units of half the reward's J_ref.
         """
-        world, (density, stations, reference_cost) = self.world, self._tools(observation)
+        world, (density, stations, reference_cost, fields) = self.world, self._tools(observation)
         n, way = world.n_agents, self.steps * world.dt
-        fields = observation_fields(world, density)
         position = observation[..., fields["position"]] * world.length_scale + density.bounds.mean(-1)
         share = observation[..., fields["energy"]].squeeze(-1)
         my = position + way * own
@@ -74,13 +73,14 @@ class Foresight(nn.Module):
             cost = cost_of_own(my, their, density.points, weights) + density.cell_moment
         return torch.cat([own_battery.unsqueeze(-1), others_battery, cost.unsqueeze(-1) * (2 / reference_cost)], dim=-1)
 
-    def _tools(self, like: Tensor) -> tuple[Density, Tensor, float]:
-        """Density on few points, stations ``(M, d)`` and J_ref, on the device of ``like``."""
+    def _tools(self, like: Tensor) -> tuple[Density, Tensor, float, dict[str, slice]]:
+        """Density on few points, stations ``(M, d)``, J_ref and the observation's fields, on the device of ``like``."""
         if like.device not in self._on:
             coarse = dataclasses.replace(self.world, resolution=POINTS_PER_AXIS[self.world.dimension])
             stations = torch.tensor(coarse.station_positions, dtype=coarse.torch_dtype, device=like.device)
             reference_cost = Density(self.world, like.device).reference_cost()  # of the reward, on all points
-            self._on[like.device] = (Density(coarse, like.device), stations, reference_cost)
+            density = Density(coarse, like.device)
+            self._on[like.device] = (density, stations, reference_cost, observation_fields(self.world, density))
         return self._on[like.device]
 
 
