@@ -16,8 +16,9 @@ from agents.report_runs import Run, check_runs, find_runs, read_curves
 from agents.report_statistics import Bootstrap, Groups, compute_curves, compute_rows
 from agents.report_tables import Report, find_method, write_curves, write_rows, write_runs
 from conf.callbacks import one_clear_error
+from conf.naming import config_hash
 from conf.report_schema import ReportConfig
-from conf.schema import config_hash, register, to_config
+from conf.schema import register, to_config
 
 register()
 logging.getLogger("tensorboard").setLevel(logging.ERROR)

@@ -7,7 +7,6 @@ import functools
 import json
 import logging
 import sys
-import time
 from pathlib import Path
 
 import hydra
@@ -18,17 +17,20 @@ from omegaconf import DictConfig
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents.checkpoint import keep_newest, save_checkpoint, set_aside, world_sizes
+from agents.checkpoint import world_sizes
 from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import check_violations
+from agents.interruption import StopSignals
 from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
-from agents.pipeline import MultiStep, make_buffer, make_collector, pick_device, to_transitions, use_threads
-from agents.recorder import Every, TrainingRecorder
+from agents.pipeline import MultiStep, collect, make_buffer, pick_device, to_transitions, use_threads
+from agents.recorder import Every, Seconds, TrainingRecorder
+from agents.training_state import TrainingState
 from conf.callbacks import one_clear_error
+from conf.naming import hashed_config
 from conf.run_folder import announce_certificate, finished_run, write_json
-from conf.schema import Config, config_hash, register, to_config
-from conf.versions import git_hash, package_versions
+from conf.schema import Config, register, to_config
+from conf.versions import run_origin
 from envs import SurveillanceEnv, keys
 from envs.rendering import save_training_curve
 
@@ -45,16 +47,9 @@ def main(cfg: DictConfig) -> None:
     if message := finished_run(folder, config.resume):  # a job of a multirun; single runs end before they get here
         tqdm.write(message)
         return
-    set_aside(folder)
-    origin = {
-        "config_hash": config_hash(cfg),
-        "git_hash": git_hash(),
-        "versions": package_versions(),
-        "seed": config.seed,
-    }
-
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
-    start, device = time.perf_counter(), pick_device(config.device)
+    seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
+    device = pick_device(config.device)
     use_threads(config.threads)
     env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
     torch.manual_seed(config.seed)
@@ -69,90 +64,95 @@ def main(cfg: DictConfig) -> None:
     minibatches = config.env.n_agents if config.agent.minibatch == "per_agent" else 1
     buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma)
-    collector = make_collector(env, explore_policy, config.collector.frames_per_batch, config.collector.total_frames)
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
-    writer = SummaryWriter(str(folder))
+    clocks = {
+        "log": Every(max(1, config.collector.total_frames // 200)),
+        "evaluate": Every(config.eval.interval_frames),
+        "save_frames": Every(config.checkpoint.interval_frames),
+        "save_episodes": Every(config.checkpoint.interval_episodes),
+    }
+    parts = {"actor": actor, "loss": loss_module, "optimizers": optimizers, "env": env, "noise": explore_policy[1]}
+    parts |= {"multi_step": multi_step, "recorder": recorder, "clocks": clocks, "seconds": seconds}
+    origin, settings = run_origin(cfg, device), config.checkpoint
+    made_for = {"config": hashed_config(cfg), "world": world_sizes(env)}
+    state = TrainingState(folder, parts, buffer, origin | made_for, keep=settings.keep, with_buffer=settings.buffer)
     adversary = config.adversary_reward()
     check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
-    announce_certificate(folder, config.env)
 
     def log(scalars: dict[str, float]) -> None:
         for tag, value in scalars.items():
             writer.add_scalar(tag, value, recorder.frames)
 
-    def evaluate() -> dict:
+    def evaluate() -> None:
         eval_env.set_seed(eval_seed)  # the same start states every time
         steps = config.eval.steps or rollout_steps(config.env.horizon)
         metrics, statistics, _ = evaluate_policy(eval_env, policy, steps, check=check)
         log(evaluation_scalars(metrics))
-        return metrics | {"filter": statistics}
+        if recorder.evaluated(metrics | {"filter": statistics}):
+            state.save_best()
 
-    def checkpoint() -> None:
-        content = {
-            "world": world_sizes(env),
-            "seed": config.seed,
-            "actor": actor.state_dict(),
-            "loss": loss_module.state_dict(),
-            "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
-            "env": env.state_dict(),
-            "noise": explore_policy[1].get_extra_state(),
-            "recorder": recorder.state_dict(),
-        }
-        save_checkpoint(folder / "checkpoints" / f"frames_{recorder.frames:012d}.pt", content)
-        keep_newest(folder / "checkpoints", config.checkpoint.keep)
+    # ---- resume: a run that was killed goes on where its newest checkpoint left it
+    kept_rows = state.resume(config.resume, tqdm.write)
+    resumed_at = recorder.frames
+    learn_from = config.train.warmup_frames + (0 if kept_rows else resumed_at)
+    writer = SummaryWriter(str(folder), purge_step=resumed_at + 1 if resumed_at else None)
+    announce_certificate(folder, config.env)
+    seconds.spent("build")
+    if not resumed_at:
+        evaluate()  # the untrained policy
+    seconds.spent("evaluate")
 
     # ---- train: noise, then filter, then execution (explore_policy); the buffer holds executed and nominal actions
-    log_due = Every(max(1, config.collector.total_frames // 200))
-    eval_due, save_due = Every(config.eval.interval_frames), Every(config.checkpoint.interval_frames)
-    episodes_due = Every(config.checkpoint.interval_episodes)
-    seconds = {"collect": 0.0, "update": 0.0, "evaluate": 0.0}
     losses: dict[str, torch.Tensor] = {}
-    evaluate()  # the untrained policy
+    total = config.collector.total_frames
     interval = 1.0 if sys.stderr.isatty() else 30.0  # a line now and then in a log file
-    bar = tqdm(total=config.collector.total_frames, unit="frame", unit_scale=True, mininterval=interval)
-    mark = time.perf_counter()
-    for batch in collector:
-        recorder.update(batch)
-        check(batch)
-        transitions = to_transitions(batch, config.train.violation_penalty, adversary)
-        if len(steps := multi_step(transitions)):
-            buffer.extend(steps)
-        collected = time.perf_counter()
-        if recorder.frames >= config.train.warmup_frames and len(buffer):
-            for _ in range(config.train.n_updates):
-                losses = update_step(buffer.sample(), loss_module, optimizers, target_updater, config.agent)
-        updated = time.perf_counter()
-        if log_due(recorder.frames):
-            scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
-            scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # the objective's
-            numbers = {name: float(value) for name, value in losses.items()}
-            check_finite(numbers, recorder.frames)
-            log(scalars | {f"loss/{name}": value for name, value in numbers.items()})
-            log({f"time/{name}_s": value for name, value in seconds.items()})
-            log({"time/frames_per_second": recorder.frames / (updated - start)})
-            bar.set_postfix_str(recorder.progress(scalars), refresh=False)
-        bar.update(batch.numel())
-        if eval_due(recorder.frames) and recorder.frames < config.collector.total_frames:  # the last one follows below
-            evaluate()
-        if save_due(recorder.frames) | episodes_due(recorder.episodes.episodes):
-            checkpoint()
-        seconds["collect"] += collected - mark
-        seconds["update"] += updated - collected
-        mark = time.perf_counter()
-        seconds["evaluate"] += mark - updated
-    collector.shutdown()
+    bar = tqdm(total=total, initial=resumed_at, unit="frame", unit_scale=True, mininterval=interval)
+    with StopSignals() as stop:
+        per_batch = config.collector.frames_per_batch
+        for batch in collect(env, explore_policy, per_batch, total - resumed_at, resumed=resumed_at > 0):
+            recorder.update(batch)
+            check(batch)
+            transitions = to_transitions(batch, config.train.violation_penalty, adversary)
+            if len(steps := multi_step(transitions)):
+                buffer.extend(steps)
+            seconds.spent("collect")
+            if recorder.frames >= learn_from and len(buffer):
+                for _ in range(config.train.n_updates):
+                    losses = update_step(buffer.sample(), loss_module, optimizers, target_updater, config.agent)
+            seconds.spent("update")
+            if clocks["log"](recorder.frames):
+                scalars = recorder.scalars() | {"train/noise": explore_policy[1].sigma}
+                scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # the objective's
+                numbers = {name: float(value) for name, value in losses.items()}
+                check_finite(numbers, recorder.frames)
+                log(scalars | {f"loss/{name}": value for name, value in numbers.items()})
+                log({f"time/{name}_s": value for name, value in seconds.totals.items()})
+                log({"time/frames_per_second": recorder.frames / seconds.total()})
+                bar.set_postfix_str(recorder.progress(scalars), refresh=False)
+            bar.update(batch.numel())
+            ends = recorder.frames == total
+            if clocks["evaluate"](recorder.frames) | ends:
+                evaluate()
+            seconds.spent("evaluate")
+            save = clocks["save_frames"](recorder.frames) | clocks["save_episodes"](recorder.episodes.episodes)
+            if save or ends or stop.received:
+                writer.flush()  # what it has logged is on disk before the checkpoint that says so
+                state.save()
+            seconds.spent("checkpoint")
+            stop.check(f"at {recorder.frames} frames, checkpoint written in {folder}")
     bar.close()
 
     # ---- conclude
-    checkpoint()
-    metrics = evaluate()
     curves = {name: np.array(values) for name, values in recorder.episodes.finished.items()}
     save_training_curve(curves, folder / "figures" / "training.png")
-    wall_time = time.perf_counter() - start
-    speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds}
-    write_json(folder / "summary.json", origin | recorder.summary() | speed | {"eval": metrics})
+    wall_time = seconds.total()
+    speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds.totals}
+    kept = {"checkpoint": {"buffer": settings.buffer}}
+    metrics = {"eval": recorder.evaluation}
+    write_json(folder / "summary.json", origin | recorder.summary() | speed | kept | metrics)
+    state.finish()
     writer.close()
-    tqdm.write(f"{folder}/summary.json\n{json.dumps(metrics, indent=2)}")
+    tqdm.write(f"{folder}/summary.json\n{json.dumps(recorder.evaluation, indent=2)}")
 
 
 if __name__ == "__main__":

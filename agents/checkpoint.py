@@ -1,22 +1,24 @@
 """Checkpoints: written atomically, read with ``weights_only``, refused with a reason when they do not fit."""
 
 import os
+import zipfile
 from pathlib import Path
 
 import torch
 
 from envs import SurveillanceEnv
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)  # format 1 holds the networks, but not all that a run needs to go on
 WORLD_REMEDY = "Use the world that the run was trained in (leave env out), or train in this one."
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is missing, unreadable or of another world; the message says which and what to do."""
+    """A checkpoint that is missing, unreadable, unwritable or of another world; the message says which and what to do."""
 
 
 def save_checkpoint(path: Path, content: dict) -> Path:
-    """Write ``content`` (tensors, numbers, strings, lists, dicts) so that ``path`` is complete or absent.
+    """Write ``content`` (tensors, numbers, strings, lists, dicts) so that ``path`` is complete or absent, whatever happens.
 
     Args:
         path: file to write.
@@ -24,22 +26,52 @@ def save_checkpoint(path: Path, content: dict) -> Path:
 
     Returns:
         The path.
+
+    Raises:
+        CheckpointError: if it cannot be written (full disk, read-only folder); what ``path`` held before is still there.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             torch.save({"format": FORMAT, **content}, file)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+        _sync_folder(path.parent)
+    except (OSError, RuntimeError) as error:  # torch turns some write errors into RuntimeErrors
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"checkpoint {path} cannot be written ({reason}). Earlier ones are kept. Free space or make the folder writable, "
+            "then the same command goes on from the newest."
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)  # left over only if writing failed
+        _remove(temporary)  # left over only if writing failed
     return path
 
 
-def set_aside(folder: Path) -> Path | None:
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in ``folder`` survive a power failure."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:  # a read-only folder: the error that is on its way says so
+        return
+
+
+def set_aside(folder: Path, found: list[Path] | None = None) -> Path | None:
     """Move what an earlier run wrote into ``folder`` to ``replaced_<k>`` inside it, so that nothing is mixed or lost.
+
+    Args:
+        folder: the run's folder.
+        found: what to move; everything that a run writes if not given.
 
     Returns:
         The folder moved to; None if there was nothing.
@@ -53,42 +85,59 @@ def set_aside(folder: Path) -> Path | None:
         "violation.json",
         "events.out.tfevents.*",
     )
-    found = [path for pattern in patterns for path in folder.glob(pattern)]
+    if found is None:
+        found = [path for pattern in patterns for path in folder.glob(pattern)]
     if not found:
         return None
     target = folder / f"replaced_{1 + len(list(folder.glob('replaced_*')))}"
-    target.mkdir()
     for path in found:
-        path.rename(target / path.name)
+        (target / path.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
+        path.rename(target / path.relative_to(folder))
     return target
 
 
 def keep_newest(folder: Path, keep: int) -> None:
     """Delete all but the ``keep`` newest checkpoints of ``folder``; 0 keeps all."""
     if keep:
-        for old in sorted(folder.glob("*.pt"))[:-keep]:
+        for old in checkpoints(folder)[:-keep]:
             old.unlink()
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict:
-    """Read a checkpoint.
+    """Read a checkpoint, every byte of it checked against the checksums that its zip archive holds.
 
     Raises:
-        CheckpointError: if the file is missing, truncated, foreign or of another format.
+        CheckpointError: if the file is missing, truncated, damaged, foreign or of another format.
     """
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist: give the folder of a run that has written one.")
     try:
+        with zipfile.ZipFile(path) as archive:
+            if damaged := archive.testzip():  # torch.load does not look at the checksums
+                raise zipfile.BadZipFile(f"{damaged} is damaged")
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
         raise CheckpointError(
             f"checkpoint {path} cannot be read ({type(error).__name__}): it is damaged or not a checkpoint of this project. "
-            "Use another file of its folder."
+            f"{_other_of(path)}"
         ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else None
-        raise CheckpointError(f"checkpoint {path} has format {found}, this version reads format {FORMAT}: train again.")
+    found = content.get("format") if isinstance(content, dict) else None
+    if found not in READABLE:
+        raise CheckpointError(
+            f"checkpoint {path} has format {found}, this version reads formats {READABLE[0]} to {READABLE[-1]}: train again, "
+            "or use the version of this project that wrote it."
+        )
     return content
+
+
+def _other_of(path: Path) -> str:
+    others = [other for other in checkpoints(path.parent) if other.name < path.name]
+    return f"The one before it is {others[-1]}." if others else "Use another file of its folder."
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a ``checkpoints`` folder, oldest first (they are named by frames, zero-padded)."""
+    return sorted(folder.glob("frames_*.pt"))
 
 
 def latest_checkpoint(run: Path) -> Path:
@@ -97,7 +146,7 @@ def latest_checkpoint(run: Path) -> Path:
     Raises:
         CheckpointError: if there is none.
     """
-    found = sorted((run / "checkpoints").glob("*.pt"))  # named by frames, zero-padded
+    found = checkpoints(run / "checkpoints")
     if not found:
         raise CheckpointError(
             f"run={run} has no checkpoint in {run / 'checkpoints'}: give the folder of a run that wrote one."

@@ -1,9 +1,10 @@
 """Construction of the training pipeline: environment, collector and replay buffer."""
 
+from collections.abc import Iterator
 from typing import cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -37,21 +38,38 @@ def use_threads(threads: int) -> None:
         torch.set_num_threads(threads)
 
 
-def make_collector(
-    env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, total_frames: int
-) -> Collector:
-    """TorchRL collector of ``(num_envs, T)`` batches; warm-up uses the policy, never the environment's random action."""
-    return Collector(
+def collect(
+    env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, frames: int, *, resumed: bool = False
+) -> Iterator[TensorDictBase]:
+    """Batches ``(num_envs, T)`` of TorchRL's collector; warm-up uses the policy, never the environment's random action.
+
+    Args:
+        env: the worlds, closed at the end.
+        policy: noise, then filter.
+        frames_per_batch: world-steps of a batch.
+        frames: world-steps in all.
+        resumed: the policy's noise goes on from a checkpoint.
+    """
+    if not frames:  # a run that was stopped after its last batch
+        return
+    noise_state = policy.state_dict()
+    collector = Collector(
         env,
         policy,
         frames_per_batch=frames_per_batch,
-        total_frames=total_frames,
+        total_frames=frames,
         device=env.device,
         split_trajs=False,
         track_traj_ids=False,
         trust_policy=True,
         auto_register_policy_transforms=False,  # the noise reads the world's own step count
     )
+    if resumed:  # a new collector tries its policy once, which draws noise; the first one's trial is part of the stream
+        policy.load_state_dict(noise_state)
+    try:
+        yield from collector
+    finally:
+        collector.shutdown()
 
 
 def make_buffer(capacity: int, batch_size: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
@@ -99,6 +117,17 @@ class MultiStep:
     def __init__(self, n_steps: int, gamma: float) -> None:
         self.n_steps, self.gamma = n_steps, gamma
         self.waiting: TensorDictBase | None = None
+
+    def state_dict(self) -> dict:
+        """The steps that wait, for checkpoints."""
+        if self.waiting is None:
+            return {"waiting": None}
+        return {"waiting": self.waiting.to_dict(), "shape": list(self.waiting.shape)}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        waiting = state["waiting"]
+        self.waiting = None if waiting is None else TensorDict(waiting, state["shape"])
 
     def __call__(self, transitions: TensorDictBase) -> TensorDictBase:
         """``(num_envs, T) -> (num_envs * T,)``, less than that at the start."""

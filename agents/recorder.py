@@ -1,5 +1,8 @@
 """What a training run measures: violations, episodes and filter over the batches, in numbers for log and summary."""
 
+import math
+import time
+
 import torch
 from tensordict import TensorDictBase
 
@@ -22,6 +25,44 @@ class Every:
         self.next = count - count % self.interval + self.interval
         return True
 
+    def state_dict(self) -> dict:
+        """When it is due next, for checkpoints."""
+        return {"next": self.next}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.next = state["next"]
+
+
+class Seconds:
+    """Wall time by what it was spent on, over all the processes that a run took.
+
+    Args:
+        names: what time is spent on.
+    """
+
+    def __init__(self, *names: str) -> None:
+        self.totals = dict.fromkeys(names, 0.0)
+        self._mark = time.perf_counter()
+
+    def spent(self, name: str) -> None:
+        """The time since the last call went to ``name``."""
+        now = time.perf_counter()
+        self.totals[name] += now - self._mark
+        self._mark = now
+
+    def total(self) -> float:
+        """Sum of all."""
+        return sum(self.totals.values())
+
+    def state_dict(self) -> dict:
+        """The totals, for checkpoints."""
+        return dict(self.totals)
+
+    def load_state_dict(self, state: dict) -> None:
+        """Go on counting from what :meth:`state_dict` returned."""
+        self.totals = {name: state.get(name, 0.0) for name in self.totals}
+
 
 class TrainingRecorder:
     """Counts every collected transition once.
@@ -40,6 +81,18 @@ class TrainingRecorder:
         self.filter = FilterStatistics(world.max_speed)
         self._recent = FilterStatistics(world.max_speed)
         self._cost = [0.0, 0]
+        self.evaluation: dict = {}
+        """Metrics of the last evaluation."""
+        self.best_cost = math.inf
+        """Least coverage cost of the evaluations."""
+
+    def evaluated(self, metrics: dict) -> bool:
+        """Take in the metrics of an evaluation; True if its coverage cost is the least so far."""
+        self.evaluation, cost = metrics, metrics["coverage_cost"]
+        if cost is None or cost >= self.best_cost:
+            return False
+        self.best_cost = cost
+        return True
 
     def update(self, batch: TensorDictBase) -> None:
         """Take in a collected batch ``(num_envs, T)``."""
@@ -90,17 +143,22 @@ class TrainingRecorder:
         }
 
     def state_dict(self) -> dict:
-        """Counters and finished episodes, for checkpoints."""
+        """Everything counted so far, the running episodes too, for checkpoints."""
         return {
             "frames": self.frames,
             "violations": dict(self.violations),
-            "finished": {name: list(rows) for name, rows in self.episodes.finished.items()},
-            "filter": dict(self.filter.sums),
-            "max_residual": self.filter.max_residual,
+            "episodes": self.episodes.state_dict(),
+            "filter": self.filter.state_dict(),
+            "recent": self._recent.state_dict(),
+            "cost": list(self._cost),
+            "evaluation": self.evaluation,
+            "best_cost": self.best_cost,
         }
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.frames, self.violations = state["frames"], dict(state["violations"])
-        self.episodes.finished = {name: list(rows) for name, rows in state["finished"].items()}
-        self.filter.sums, self.filter.max_residual = dict(state["filter"]), state["max_residual"]
+        self.frames, self.violations, self._cost = state["frames"], dict(state["violations"]), list(state["cost"])
+        self.evaluation, self.best_cost = state["evaluation"], state["best_cost"]
+        self.episodes.load_state_dict(state["episodes"])
+        self.filter.load_state_dict(state["filter"])
+        self._recent.load_state_dict(state["recent"])

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import signal
 import sys
 import textwrap
 import traceback
@@ -17,10 +18,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from agents.checkpoint import CheckpointError
 from agents.incident import ViolationError
+from agents.interruption import InterruptedRunError
 from agents.maddpg import DivergedError
 from agents.report_runs import ReportError
 from conf.run_folder import finished_run
-from conf.schema import check_evaluation, to_config
+from conf.schema import check_evaluation, check_training, to_config
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 EXPECTED_IN_RUN = (
@@ -65,6 +67,12 @@ class ValidateConfig(Callback):
             sys.exit(0)
 
 
+class ValidateTraining(ValidateConfig):
+    """The same for train.py, with the checkpoint that ``resume`` names."""
+
+    check = staticmethod(check_training)
+
+
 class ValidateEvaluation(ValidateConfig):
     """The same for evaluate.py, with the run that it names."""
 
@@ -81,6 +89,12 @@ def one_clear_error(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
     def wrapper(cfg: DictConfig) -> None:
         try:
             main(cfg)
+        except InterruptedRunError as stop:  # ends a multirun too
+            sys.stderr.write(f"{stop}\n")
+            sys.exit(stop.exit_code)
+        except KeyboardInterrupt:  # before the first batch, or a second Ctrl-C
+            sys.stderr.write("stopped by SIGINT.\n")
+            sys.exit(128 + signal.SIGINT)
         except EXPECTED_IN_RUN as error:
             multirun = HydraConfig.get().mode == RunMode.MULTIRUN
             if multirun or cfg.get("debug", False) or os.environ.get("HYDRA_FULL_ERROR") == "1":

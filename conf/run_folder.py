@@ -26,7 +26,9 @@ def finished_evaluation(path: Path, asked: dict) -> bool:
 
 def finished_run(folder: Path, resume: str | None) -> str | None:
     """What to tell the user if ``folder`` holds a finished run that is to be left alone; None otherwise."""
-    if resume != "auto" or not (folder / "summary.json").is_file():
+    if resume in (None, "never") or not (folder / "summary.json").is_file():
+        return None
+    if folder.resolve() in (Path(resume).resolve(), *Path(resume).resolve().parents):  # one of its own checkpoints
         return None
     return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
 

@@ -1,7 +1,5 @@
 """Typed root configuration of train.py and evaluate.py, its checks, and the registration of all schemas with Hydra."""
 
-import hashlib
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,16 +11,15 @@ from agents import AgentConfig, make_controller
 from agents.adversary_reward import BARRIERS, AdversaryReward
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
 from agents.controllers import CONTROLLERS
-from agents.evaluation import rollout_steps
 from agents.maddpg import check_loss
 from agents.pipeline import pick_device
+from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
+from conf.naming import config_hash, evaluation_folder, hashed_config
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
 from safety import SafetyConfig
 
-# Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = ("seed", "device", "threads", "resume", "debug", "checkpoint", "hydra", "folder")
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -128,7 +125,10 @@ class CheckpointConfig:
     interval_frames: int = 250_000
     """World-steps between checkpoints, >= 0 (0 = do not count frames): for worlds whose episodes do not end."""
     keep: int = 3
-    """Newest checkpoints kept, >= 0 (0 = all)."""
+    """Newest checkpoints kept, >= 0 (0 = all), beside best.pt."""
+    buffer: bool = True
+    """Save the replay buffer too, so that a run that was killed goes on to the same bits. Each checkpoint writes the rows
+    that are new; a finished run deletes them. false: a resumed run refills an empty buffer first."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -148,8 +148,9 @@ class Config:
     threads: int = 1
     """CPU threads, 0..1024; 0 = PyTorch's choice. One is fastest for tensors of this size, by a factor of 4 on 2 cores."""
     resume: str = "auto"
-    """auto: a finished run is left alone, an unfinished one starts anew. never: start anew in the same folder.
-    What an earlier run left there is moved to replaced_<k>."""
+    """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
+    the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
+    of that run's folder; only collector.total_frames, train, eval and compile may differ from its settings."""
     compile: bool = False
     """Run the pure tensor functions of step and shield through torch.compile (a minute at the start); same results to
     rounding. Where there is no C++ compiler: a warning, and as false."""
@@ -167,7 +168,11 @@ class Config:
     def __post_init__(self) -> None:
         """Check the combinations that no group can check alone."""
         _check_common(self)
-        check_choice("resume", self.resume, ("auto", "never"))
+        if self.resume not in ("auto", "never") and not Path(self.resume).exists():
+            raise ValueError(
+                f"resume={self.resume} is neither auto nor never, and no such file or folder exists: give a checkpoint "
+                "(<run folder>/checkpoints/frames_*.pt) or a run's folder."
+            )
         self.safety.gains(self.env)
         check_loss(self.agent, self.safety)
         steps = self.collector.total_frames // self.collector.num_envs
@@ -288,6 +293,16 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
     return to_config(given)
 
 
+def check_training(cfg: DictConfig) -> None:
+    """Raise what is wrong with a training run before anything is written: values, and the checkpoint that resume names."""
+    config: Config = to_config(cfg)
+    if config.resume not in ("auto", "never"):
+        path, content = named_checkpoint(Path(config.resume), tell=lambda line: None)
+        own = path.parent.parent.resolve() == Path(str(cfg.hydra.run.dir)).resolve()
+        here = {"config": hashed_config(cfg), "seed": config.seed}
+        check_origin(path, content, here, may_differ=() if own else MAY_DIFFER)
+
+
 def check_evaluation(cfg: DictConfig) -> None:
     """Raise what is wrong with an evaluation before anything is written: values, run folder, checkpoint, its world."""
     config = to_config(cfg)
@@ -305,36 +320,3 @@ def check_evaluation(cfg: DictConfig) -> None:
         world = run_config(cfg, list(cfg.hydra.overrides.task)).env
         path = find_checkpoint(Path(config.run), config.checkpoint)
         check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(world)))
-
-
-def config_hash(cfg: DictConfig) -> str:
-    """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
-    names = [str(name) for name in cfg if name not in NOT_HASHED]
-    content = {name: _plain(cfg, name) for name in sorted(names)}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:8]
-
-
-def _plain(cfg: DictConfig, name: str) -> Any:
-    value = cfg[name]
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def evaluation_folder(cfg: DictConfig) -> str:
-    """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers.
-
-    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten.
-    """
-    choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
-    world, horizon = choices.env, cfg.env.horizon
-    if cfg.run is not None and not any(entry.startswith("env=") for entry in overrides):
-        hydra_folder = Path(cfg.run) / ".hydra"
-        world = OmegaConf.load(hydra_folder / "hydra.yaml").hydra.runtime.choices.env
-        if not any(entry.startswith("env.horizon=") for entry in overrides):
-            horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
-    name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
-    changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in ("env", "safety", "checkpoint")]
-    if cfg.run is not None:
-        suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
-        return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
-    folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
-    return str(Path(cfg.folder).absolute() / folder)

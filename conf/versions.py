@@ -1,10 +1,15 @@
-"""Where a run came from: package versions and the commit."""
+"""Where a run came from: configuration, package versions, commit, device."""
 
 import functools
 import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+
+from conf.naming import config_hash
 
 PACKAGES = ("torch", "torchrl", "tensordict", "qpth", "numpy", "hydra-core", "omegaconf")
 
@@ -35,3 +40,15 @@ def git_hash() -> str:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return run.stdout.strip()
+
+
+def run_origin(cfg: DictConfig, device: torch.device) -> dict:
+    """What summary.json and the checkpoints say of where a run came from."""
+    return {
+        "config_hash": config_hash(cfg),
+        "git_hash": git_hash(),
+        "versions": package_versions(),
+        "seed": cfg.seed,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "threads": torch.get_num_threads(),
+    }

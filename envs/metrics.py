@@ -127,3 +127,14 @@ class EpisodeTracker:
     def episodes(self) -> int:
         """Number of finished episodes."""
         return len(self.finished["return"])
+
+    def state_dict(self) -> dict:
+        """Sums of the running episodes and all finished ones, for checkpoints."""
+        finished = {name: list(rows) for name, rows in self.finished.items()}
+        return {"reward": self.reward.clone(), "violations": self.violations.clone(), "finished": finished}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.reward.copy_(state["reward"])
+        self.violations.copy_(state["violations"])
+        self.finished = {name: list(rows) for name, rows in state["finished"].items()}

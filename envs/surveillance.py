@@ -71,6 +71,7 @@ class SurveillanceEnv(EnvBase):
         self.generator = torch.Generator(device=device)
         self._make_specs()
         self._set_seed(seed)
+        self._continues = False
         self._state = self._blank_state()
         self._write_start(torch.ones(num_envs, dtype=torch.bool, device=device))
 
@@ -82,7 +83,8 @@ class SurveillanceEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            mask = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+            mask = torch.full(self.batch_size, not self._continues, device=self.device)
+            self._continues = False
         self._write_start(mask.reshape(self.batch_size))
         out = self._outputs(*self._watch(self._state["position"], self._state["density"], advance=False))
         for kind in keys.VIOLATION_KINDS:
@@ -145,6 +147,17 @@ class SurveillanceEnv(EnvBase):
                 )
         self._state = TensorDict(dict(given.items()), self.batch_size, device=self.device)
         self.generator.set_state(state_dict["generator"].cpu())
+
+    def continue_from(self, state_dict: dict) -> None:
+        """:meth:`load_state_dict`, and the next reset of all worlds returns that state instead of drawing start states.
+
+        So a collector, which begins with a reset, goes on where another one was stopped.
+
+        Raises:
+            ValueError: as :meth:`load_state_dict`.
+        """
+        self.load_state_dict(state_dict)
+        self._continues = True
 
     def set_state(self, position: Tensor, energy: Tensor, slot: Tensor | None = None) -> TensorDictBase:
         """Place all robots by hand (tests, replays) and return the outputs of that state, as ``reset`` would.

@@ -81,3 +81,13 @@ class FilterStatistics:
             "max_residual": self.max_residual,
             **(certificate if math.isfinite(self.least_certificate) else {}),  # smallest G - Delta_G, m
         }
+
+    def state_dict(self) -> dict:
+        """All sums, for checkpoints."""
+        extremes = {"max_residual": self.max_residual, "least_certificate": self.least_certificate}
+        return {"sums": dict(self.sums), **extremes}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.sums = dict(state["sums"])
+        self.max_residual, self.least_certificate = state["max_residual"], state["least_certificate"]

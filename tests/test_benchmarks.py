@@ -82,3 +82,10 @@ def test_accuracy_program(load, capsys):
     rows = [line.split("|")[1:-1] for line in out.splitlines() if line.startswith("| ")]
     assert sum(row[0].strip() == "1" for row in rows) == 30
     assert sum(row[0].strip() == "15" for row in rows) == 2
+
+
+def test_kill_study(load, capsys):
+    assert load("kill_study").main(["--kills", "2", "--seed", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "0 differences" in out
+    assert "| killed | processes |" in out

@@ -97,12 +97,14 @@ def test_unreadable_file(tmp_path, make):
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("foreign", [{"format": 2}, {"weights": 1}, [1, 2], torch.zeros(3)], ids=str)
+@pytest.mark.parametrize("foreign", [{"format": 3}, {"weights": 1}, [1, 2], torch.zeros(3)], ids=str)
 def test_other_format(tmp_path, foreign):
     path = tmp_path / "other.pt"
     torch.save(foreign, path)
     found = foreign.get("format") if isinstance(foreign, dict) else None
-    with pytest.raises(CheckpointError, match=rf"{path} has format {found}, this version reads format 1: train again"):
+    with pytest.raises(
+        CheckpointError, match=rf"{path} has format {found}, this version reads formats 1 to 2: train again"
+    ):
         load_checkpoint(path)
 
 

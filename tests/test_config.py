@@ -147,7 +147,7 @@ BAD = [
     ("agent.correction_penalty=1", "safety.in_loss=true"),
     ("buffer.capacity=1", "one minibatch"),
     ("device=tpu", "auto, cpu, cuda"),
-    ("resume=maybe", "auto, never"),
+    ("resume=maybe", "neither auto nor never"),
 ]
 
 

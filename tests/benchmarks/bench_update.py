@@ -18,7 +18,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, update_step
 from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
-from agents.pipeline import make_buffer, make_collector, to_transitions
+from agents.pipeline import collect, make_buffer, to_transitions
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig
 
@@ -88,7 +88,7 @@ def training_rows(world: SurveillanceConfig, options, budget: harness.Budget) ->
         actor, update = make_update(VANILLA if name == VANILLA else "MADDPG", env, agent)
         safety = harness.FILTERS["none" if name == VANILLA else name]
         _, explore = make_policies(actor, world, safety, agent, 0, env.device)
-        collector = make_collector(env, explore, frames, -1)
+        collector = collect(env, explore, frames, -1)
         collectors.append(collector)
         buffer, batches = make_buffer(100_000, options.batches[0], env.device, 0), iter(collector)
 
@@ -99,7 +99,7 @@ def training_rows(world: SurveillanceConfig, options, budget: harness.Budget) ->
         chains[name] = (lambda batches=batches: next(batches), learn)
     times = budget.medians(chains, frames, ("training", world.n_agents))
     for collector in collectors:
-        collector.shutdown()
+        collector.close()
     base = times[VANILLA] and sum(times[VANILLA])
     return [
         [

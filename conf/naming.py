@@ -1,0 +1,49 @@
+"""Names of run folders: a digest of what decides a run's result, and where evaluations go."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from agents.evaluation import rollout_steps
+
+# Settings that do not change what is computed by a run of a given seed.
+NOT_HASHED = ("seed", "device", "threads", "resume", "debug", "checkpoint", "hydra", "folder")
+
+
+def config_hash(cfg: DictConfig) -> str:
+    """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
+    return hashlib.sha256(json.dumps(hashed_config(cfg), sort_keys=True).encode()).hexdigest()[:8]
+
+
+def hashed_config(cfg: DictConfig) -> dict:
+    """The resolved configuration without :data:`NOT_HASHED`, nested."""
+    return {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
+
+
+def _plain(cfg: DictConfig, name: str) -> Any:
+    value = cfg[name]
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def evaluation_folder(cfg: DictConfig) -> str:
+    """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers.
+
+    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten.
+    """
+    choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
+    world, horizon = choices.env, cfg.env.horizon
+    if cfg.run is not None and not any(entry.startswith("env=") for entry in overrides):
+        hydra_folder = Path(cfg.run) / ".hydra"
+        world = OmegaConf.load(hydra_folder / "hydra.yaml").hydra.runtime.choices.env
+        if not any(entry.startswith("env.horizon=") for entry in overrides):
+            horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
+    name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in ("env", "safety", "checkpoint")]
+    if cfg.run is not None:
+        suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
+        return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
+    folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
+    return str(Path(cfg.folder).absolute() / folder)
