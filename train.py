@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from agents.board import Board
 from agents.checkpoint import world_sizes
+from agents.divergence import check_batch, check_finite, check_weights
 from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import check_violations
 from agents.interruption import StopSignals
-from agents.maddpg import check_finite, make_loss, make_optimizers, update_step
+from agents.maddpg import make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic, make_policies
 from agents.pipeline import MultiStep, collect, make_buffer, pick_device, to_transitions, use_threads
 from agents.recorder import Every, Seconds, TrainingRecorder
@@ -50,7 +51,7 @@ def main(cfg: DictConfig) -> None:
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
     device = pick_device(config.device)
-    use_threads(config.threads)
+    use_threads(config.threads, deterministic=config.deterministic)
     env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
     torch.manual_seed(config.seed)
     env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed, compile=config.compile)
@@ -66,28 +67,27 @@ def main(cfg: DictConfig) -> None:
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma)
     recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
     clocks = {
-        "log": Every(max(1, config.collector.total_frames // 200)),
+        "log": Every(max(1, config.collector.total_frames // config.log.points)),
         "evaluate": Every(config.eval.interval_frames),
         "save_frames": Every(config.checkpoint.interval_frames),
         "save_episodes": Every(config.checkpoint.interval_episodes),
     }
+    seconds.watch("policy", explore_policy)
+    seconds.watch("filter", explore_policy[2])
     parts = {"actor": actor, "loss": loss_module, "optimizers": optimizers, "env": env, "noise": explore_policy[1]}
     parts |= {"multi_step": multi_step, "recorder": recorder, "clocks": clocks, "seconds": seconds}
-    origin, settings = run_origin(cfg, device), config.checkpoint
+    origin, keep, with_buffer = run_origin(cfg, device), config.checkpoint.keep, config.checkpoint.buffer
     made_for = {"config": hashed_config(cfg), "world": world_sizes(env)}
-    state = TrainingState(folder, parts, buffer, origin | made_for, keep=settings.keep, with_buffer=settings.buffer)
+    state = TrainingState(folder, parts, buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
     adversary = config.adversary_reward()
     check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
-
-    def log(scalars: dict[str, float]) -> None:
-        for tag, value in scalars.items():
-            writer.add_scalar(tag, value, recorder.frames)
 
     def evaluate() -> None:
         eval_env.set_seed(eval_seed)  # the same start states every time
         steps = config.eval.steps or rollout_steps(config.env.horizon)
-        metrics, statistics, _ = evaluate_policy(eval_env, policy, steps, check=check)
-        log(evaluation_scalars(metrics))
+        metrics, statistics, trajectory = evaluate_policy(eval_env, policy, steps, record=board.records, check=check)
+        board.scalars(evaluation_scalars(metrics), recorder.frames)
+        board.world(trajectory, recorder.frames)
         if recorder.evaluated(metrics | {"filter": statistics}):
             state.save_best()
 
@@ -95,7 +95,8 @@ def main(cfg: DictConfig) -> None:
     kept_rows = state.resume(config.resume, tqdm.write)
     resumed_at = recorder.frames
     learn_from = config.train.warmup_frames + (0 if kept_rows else resumed_at)
-    writer = SummaryWriter(str(folder), purge_step=resumed_at + 1 if resumed_at else None)
+    settings = hashed_config(cfg) | {"seed": config.seed}
+    board = Board(folder, resumed_at, settings, figures=config.log.figures, gif=config.log.gif)
     announce_certificate(folder, config.env)
     seconds.spent("build")
     if not resumed_at:
@@ -112,6 +113,7 @@ def main(cfg: DictConfig) -> None:
         for batch in collect(env, explore_policy, per_batch, total - resumed_at, resumed=resumed_at > 0):
             recorder.update(batch)
             check(batch)
+            check_batch(batch, recorder.frames)
             transitions = to_transitions(batch, config.train.violation_penalty, adversary)
             if len(steps := multi_step(transitions)):
                 buffer.extend(steps)
@@ -125,9 +127,10 @@ def main(cfg: DictConfig) -> None:
                 scalars["train/reward"] = float(transitions["next"][keys.REWARD].mean())  # the objective's
                 numbers = {name: float(value) for name, value in losses.items()}
                 check_finite(numbers, recorder.frames)
-                log(scalars | {f"loss/{name}": value for name, value in numbers.items()})
-                log({f"time/{name}_s": value for name, value in seconds.totals.items()})
-                log({"time/frames_per_second": recorder.frames / seconds.total()})
+                scalars |= {f"loss/{name}": value for name, value in numbers.items()}
+                board.scalars(scalars | seconds.scalars(recorder.frames), recorder.frames)
+                if config.log.histograms:
+                    board.histogram("train/energy", batch["next"][keys.ENERGY], recorder.frames)
                 bar.set_postfix_str(recorder.progress(scalars), refresh=False)
             bar.update(batch.numel())
             ends = recorder.frames == total
@@ -136,7 +139,8 @@ def main(cfg: DictConfig) -> None:
             seconds.spent("evaluate")
             save = clocks["save_frames"](recorder.frames) | clocks["save_episodes"](recorder.episodes.episodes)
             if save or ends or stop.received:
-                writer.flush()  # what it has logged is on disk before the checkpoint that says so
+                check_weights(loss_module, recorder.frames)
+                board.flush()  # what it has logged is on disk before the checkpoint that says so
                 state.save()
             seconds.spent("checkpoint")
             stop.check(f"at {recorder.frames} frames, checkpoint written in {folder}")
@@ -147,11 +151,11 @@ def main(cfg: DictConfig) -> None:
     save_training_curve(curves, folder / "figures" / "training.png")
     wall_time = seconds.total()
     speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds.totals}
-    kept = {"checkpoint": {"buffer": settings.buffer}}
+    kept = {"checkpoint": {"buffer": with_buffer}}
     metrics = {"eval": recorder.evaluation}
     write_json(folder / "summary.json", origin | recorder.summary() | speed | kept | metrics)
     state.finish()
-    writer.close()
+    board.close()
     tqdm.write(f"{folder}/summary.json\n{json.dumps(recorder.evaluation, indent=2)}")
 
 

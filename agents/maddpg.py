@@ -13,7 +13,6 @@ Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 150
 """
 
 import functools
-import math
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -27,20 +26,6 @@ from agents.pipeline import STEPS
 from envs import SurveillanceConfig, keys
 from envs.dynamics import limit_speed
 from safety import SafetyConfig, SafetyFilter
-
-
-class DivergedError(ValueError):
-    """Losses or gradients that are not finite; the message names them and the remedy."""
-
-
-def check_finite(metrics: dict[str, float], frames: int) -> None:
-    """Raise :class:`DivergedError` if a number of :func:`update_step` is not finite."""
-    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
-    if bad:
-        raise DivergedError(
-            f"training diverged at frame {frames}: {', '.join(bad)} not finite. The last checkpoint is kept. Lower agent.actor_lr "
-            "and agent.critic_lr, set agent.max_grad_norm, or look for a policy that produces NaN behind safety=none."
-        )
 
 
 class MADDPGLoss(DDPGLoss):

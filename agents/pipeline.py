@@ -1,5 +1,6 @@
 """Construction of the training pipeline: environment, collector and replay buffer."""
 
+import os
 from collections.abc import Iterator
 from typing import cast
 
@@ -32,10 +33,19 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def use_threads(threads: int) -> None:
-    """Compute on this many CPU threads; 0 leaves PyTorch's choice."""
+def use_threads(threads: int, *, deterministic: bool = False) -> None:
+    """Compute on this many CPU threads; 0 leaves PyTorch's choice.
+
+    Args:
+        threads: number of CPU threads.
+        deterministic: refuse operations that may differ between runs.
+    """
     if threads:
         torch.set_num_threads(threads)
+    if deterministic:
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS asks for it
+        torch.backends.cudnn.benchmark = False
+    torch.use_deterministic_algorithms(deterministic)
 
 
 def collect(

@@ -5,6 +5,7 @@ import time
 
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 
 from envs import SurveillanceConfig, keys
 from envs.metrics import EpisodeTracker
@@ -43,25 +44,59 @@ class Seconds:
 
     def __init__(self, *names: str) -> None:
         self.totals = dict.fromkeys(names, 0.0)
+        self.inside: dict[str, float] = {}
+        """Shares of "collect": see :meth:`watch`."""
         self._mark = time.perf_counter()
+        self._watched: dict[str, float] = {}
 
     def spent(self, name: str) -> None:
         """The time since the last call went to ``name``."""
         now = time.perf_counter()
         self.totals[name] += now - self._mark
         self._mark = now
+        for part, value in self._watched.items():
+            self.inside[part] += value if name == "collect" else 0.0
+            self._watched[part] = 0.0
+
+    def watch(self, name: str, module: nn.Module) -> None:
+        """Measure the calls of a module as a share of "collect" (on a GPU: until its work is queued)."""
+        self.inside[name], self._watched[name] = 0.0, 0.0
+        starts = []
+
+        def begin(*_: object) -> None:
+            starts.append(time.perf_counter())
+
+        def end(*_: object) -> None:
+            self._watched[name] += time.perf_counter() - starts.pop()
+
+        module.register_forward_pre_hook(begin)
+        module.register_forward_hook(end)
 
     def total(self) -> float:
         """Sum of all."""
         return sum(self.totals.values())
 
+    def scalars(self, frames: int) -> dict[str, float]:
+        """Seconds and frames per second, of all and of each part, by TensorBoard tag.
+
+        Collection splits into the filter, the policy's networks and noise (inference), and the environment with the collector.
+        """
+        parts = dict(self.totals)
+        if {"policy", "filter"} <= self.inside.keys():
+            policy, chosen = self.inside["policy"], self.inside["filter"]
+            parts |= {"filter": chosen, "inference": policy - chosen, "env": self.totals["collect"] - policy}
+        rates = {f"time/frames_per_second_{name}": frames / value for name, value in parts.items() if value > 0}
+        seconds = {f"time/{name}_s": value for name, value in parts.items()}
+        return {"time/frames_per_second": frames / max(self.total(), 1e-9)} | seconds | rates
+
     def state_dict(self) -> dict:
         """The totals, for checkpoints."""
-        return dict(self.totals)
+        return {"totals": dict(self.totals), "inside": dict(self.inside)}
 
     def load_state_dict(self, state: dict) -> None:
         """Go on counting from what :meth:`state_dict` returned."""
-        self.totals = {name: state.get(name, 0.0) for name in self.totals}
+        self.totals = {name: state["totals"].get(name, 0.0) for name in self.totals}
+        self.inside = {name: state["inside"].get(name, 0.0) for name in self.inside}
 
 
 class TrainingRecorder:
@@ -81,6 +116,7 @@ class TrainingRecorder:
         self.filter = FilterStatistics(world.max_speed)
         self._recent = FilterStatistics(world.max_speed)
         self._cost = [0.0, 0]
+        self._violations_recent = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.evaluation: dict = {}
         """Metrics of the last evaluation."""
         self.best_cost = math.inf
@@ -99,7 +135,9 @@ class TrainingRecorder:
         following = batch["next"]
         flags = {kind: following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS}
         for kind, flag in flags.items():
-            self.violations[kind] += int(flag.sum())
+            count = int(flag.sum())
+            self.violations[kind] += count
+            self._violations_recent[kind] += count
         violating = (
             torch.stack(list(flags.values())).any(dim=0).sum(-1)
         )  # robot-steps: a robot may violate twice at once
@@ -114,18 +152,20 @@ class TrainingRecorder:
         """Numbers since the last call, by TensorBoard tag; starts a new interval."""
         returns = self.episodes.finished["return"][-100:]
         counts = self.episodes.finished["violations"][-100:]
-        recent = self._recent.summary()
+        recent, robot_steps = self._recent.summary(), max(self._cost[1] * self.world.n_agents, 1)
         scalars = {
             "train/episodes": self.episodes.episodes,
             "train/coverage_cost": self._cost[0] / max(self._cost[1], 1),
             **{f"train/violations_{kind}": count for kind, count in self.violations.items()},
+            **{f"train/violation_rate_{kind}": count / robot_steps for kind, count in self._violations_recent.items()},
+            "filter/hold_rate": recent["fallback_rate"] - recent["homing_rate"],
             **{f"filter/{name}": recent[name] for name in recent},
         }
         if returns:
             scalars["train/return"] = sum(returns) / len(returns)
             scalars["train/violations_per_episode"] = sum(counts) / len(counts)
         self._recent = FilterStatistics(self.world.max_speed)
-        self._cost = [0.0, 0]
+        self._cost, self._violations_recent = [0.0, 0], dict.fromkeys(keys.VIOLATION_KINDS, 0)
         return scalars
 
     def progress(self, scalars: dict[str, float]) -> str:
@@ -151,6 +191,7 @@ class TrainingRecorder:
             "filter": self.filter.state_dict(),
             "recent": self._recent.state_dict(),
             "cost": list(self._cost),
+            "violations_recent": dict(self._violations_recent),
             "evaluation": self.evaluation,
             "best_cost": self.best_cost,
         }
@@ -158,6 +199,7 @@ class TrainingRecorder:
     def load_state_dict(self, state: dict) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.frames, self.violations, self._cost = state["frames"], dict(state["violations"]), list(state["cost"])
+        self._violations_recent = dict(state["violations_recent"])
         self.evaluation, self.best_cost = state["evaluation"], state["best_cost"]
         self.episodes.load_state_dict(state["episodes"])
         self.filter.load_state_dict(state["filter"])

@@ -17,9 +17,9 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from agents.checkpoint import CheckpointError
+from agents.divergence import DivergedError
 from agents.incident import ViolationError
 from agents.interruption import InterruptedRunError
-from agents.maddpg import DivergedError
 from agents.report_runs import ReportError
 from conf.run_folder import finished_run
 from conf.schema import check_evaluation, check_training, to_config

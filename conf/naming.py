@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from agents.evaluation import rollout_steps
 
 # Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = ("seed", "device", "threads", "resume", "debug", "checkpoint", "hydra", "folder")
+NOT_HASHED = ("seed", "device", "threads", "deterministic", "resume", "debug", "checkpoint", "log", "hydra", "folder")
 
 
 def config_hash(cfg: DictConfig) -> str:

@@ -138,6 +138,24 @@ class CheckpointConfig:
 
 
 @dataclass
+class LogConfig:
+    """What TensorBoard gets; none of it changes the run."""
+
+    points: int = 200
+    """Points of each curve over the whole run, 1..1e6."""
+    histograms: bool = True
+    """Histograms of the energies, with every point."""
+    figures: bool = True
+    """A figure of one world's paths at every evaluation."""
+    gif: bool = True
+    """An animation of one world at every evaluation (about 0.6 MB each)."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("log.points", self.points, 1, 10**6)
+
+
+@dataclass
 class Config:
     """Everything that train.py needs."""
 
@@ -151,6 +169,8 @@ class Config:
     """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
     the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
     of that run's folder; only collector.total_frames, train, eval and compile may differ from its settings."""
+    deterministic: bool = False
+    """Refuse operations of PyTorch that may differ between runs of the same seed (CUDA has some; slower there)."""
     compile: bool = False
     """Run the pure tensor functions of step and shield through torch.compile (a minute at the start); same results to
     rounding. Where there is no C++ compiler: a warning, and as false."""
@@ -164,6 +184,7 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    log: LogConfig = field(default_factory=LogConfig)
 
     def __post_init__(self) -> None:
         """Check the combinations that no group can check alone."""

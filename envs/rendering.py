@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
@@ -89,8 +90,8 @@ def _style(i: int) -> tuple[str, str, str]:
     return colour, MARKERS[i // 8 % 4], "black" if np.dot(to_rgb(colour), (0.21, 0.72, 0.07)) > 0.45 else "white"
 
 
-def _draw_density(ax: Axes, trajectory: Trajectory, k: int) -> None:
-    """The density of sample k as an image, with its colour bar in the column to the right."""
+def draw_density(ax: Axes, trajectory: Trajectory, k: int) -> AxesImage:
+    """Draws the density of sample k as an image, on one scale for all samples."""
     low, span = trajectory.points.min(axis=0), np.maximum(np.ptp(trajectory.points, axis=0), 1e-9)
     shape = [len(np.unique(column)) for column in np.round((trajectory.points - low) / span, 6).T]
     (w, h), (x, y) = span / np.maximum(np.subtract(shape, 1), 1), low
@@ -98,9 +99,13 @@ def _draw_density(ax: Axes, trajectory: Trajectory, k: int) -> None:
     # One scale for all frames, so that a moving density does not pulse.
     scale = {"vmin": 0.0, "vmax": float(trajectory.density.max()) / (w * h), "cmap": DENSITY_MAP}
     extent = (x - w / 2, x + span[0] + w / 2, y - h / 2, y + span[1] + h / 2)
-    image = ax.imshow(weights.T / (w * h), origin="lower", extent=extent, interpolation="bicubic", **scale)
+    return ax.imshow(weights.T / (w * h), origin="lower", extent=extent, interpolation="bicubic", **scale)
+
+
+def _draw_density_scale(ax: Axes, image: AxesImage) -> None:
+    """Colour bar of the density in the column to the right."""
     bar = ax.inset_axes((1.13, 0.06, 0.38, 0.025))
-    ax.figure.colorbar(image, cax=bar, orientation="horizontal", ticks=[0.0, scale["vmax"]], format="%.2g")
+    ax.figure.colorbar(image, cax=bar, orientation="horizontal", ticks=[0.0, image.get_clim()[1]], format="%.2g")
     bar.set_title("density φ (1/m²)", fontsize=FONT, loc="left", pad=4)
     bar.tick_params(labelsize=FONT, length=2)
 
@@ -138,7 +143,7 @@ def draw_world(ax: Axes, trajectory: Trajectory, k: int) -> None:
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 17), np.linspace(0, np.pi, 9))
     ball = trajectory.charge_radius * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
     if flat:
-        _draw_density(ax, trajectory, k)
+        _draw_density_scale(ax, draw_density(ax, trajectory, k))
         for cell in voronoi_cells(here[np.isfinite(here).all(axis=1)], trajectory.arena):
             ax.add_patch(Polygon(cell, fill=False, ec="#555555", lw=1.1, zorder=2)) if len(cell) > 2 else None
     for centre in trajectory.stations:

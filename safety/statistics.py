@@ -10,6 +10,14 @@ from envs import keys
 from safety.certificate import HOMING
 from safety.qp import QPStatus
 
+MARGINS = {
+    "min_h_c": keys.BARRIER_ENERGY,
+    "min_h_o": keys.BARRIER_OVERCHARGE,
+    "min_h_s": keys.BARRIER_COLLISION,
+    "min_certificate_margin": keys.BARRIER_CERTIFICATE,
+}
+"""Least barriers by name: survivability and overcharge (energy), collision (m^2), G - Delta_G (m)."""
+
 
 class FilterStatistics:
     """Running sums over filtered robot-steps.
@@ -34,7 +42,7 @@ class FilterStatistics:
             0.0,
         )
         self.max_residual = 0.0
-        self.least_certificate = math.inf
+        self.least: dict[str, float] = {}
 
     def update(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> None:
         """Take in filter outputs of any batch shape.
@@ -61,15 +69,19 @@ class FilterStatistics:
         for name, total in zip(self.sums, totals.tolist(), strict=True):
             self.sums[name] += total
         self.max_residual = max(self.max_residual, float(largest))
-        gap = tensordict.get(keys.BARRIER_CERTIFICATE, None)
-        if gap is not None:
-            least = torch.where(counts, gap.squeeze(-1), torch.inf).min()
-            self.least_certificate = min(self.least_certificate, float(least))
+        found = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
+        found = {
+            name: torch.where(counts, x.squeeze(-1), torch.inf).min() for name, x in found.items() if x is not None
+        }
+        if found:
+            for name, value in zip(found, torch.stack(list(found.values())).tolist(), strict=True):
+                self.least[name] = min(self.least.get(name, math.inf), value)
 
     def summary(self) -> dict[str, float]:
-        """Rates per robot-step, counts in robot-steps, mean correction in m/s, largest residual of an executed solution."""
+        """Rates per robot-step, counts in robot-steps, mean correction in m/s, largest residual of an executed solution, and
+        the least of each barrier before the steps (:data:`MARGINS`).
+        """
         steps = max(self.sums["robot_steps"], 1.0)
-        certificate = {"min_certificate_margin": self.least_certificate}
         return {
             "intervention_rate": self.sums["interventions"] / steps,
             "mean_correction": self.sums["correction"] / steps,
@@ -79,15 +91,14 @@ class FilterStatistics:
             "inaccurate": int(self.sums["inaccurate"]),
             "outside": int(self.sums["outside"]),
             "max_residual": self.max_residual,
-            **(certificate if math.isfinite(self.least_certificate) else {}),  # smallest G - Delta_G, m
+            **{name: value for name, value in self.least.items() if math.isfinite(value)},
         }
 
     def state_dict(self) -> dict:
         """All sums, for checkpoints."""
-        extremes = {"max_residual": self.max_residual, "least_certificate": self.least_certificate}
-        return {"sums": dict(self.sums), **extremes}
+        return {"sums": dict(self.sums), "max_residual": self.max_residual, "least": dict(self.least)}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.sums = dict(state["sums"])
-        self.max_residual, self.least_certificate = state["max_residual"], state["least_certificate"]
+        self.sums, self.least = dict(state["sums"]), dict(state["least"])
+        self.max_residual = state["max_residual"]

@@ -147,9 +147,13 @@ def result(folder: Path) -> dict:
         summary.pop(name)
     content = checkpoint.load_checkpoint(checkpoint.latest_checkpoint(folder))
     content["parts"].pop("seconds")
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "histograms": 0, "images": 0}).Reload()
     tags = [tag for tag in sorted(events.Tags()["scalars"]) if not tag.startswith("time/")]
-    curves = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags}
+    curves: dict[str, list] = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags}
+    for tag in events.Tags()["histograms"]:
+        curves[tag] = [(event.step, tuple(event.histogram_value.bucket)) for event in events.Histograms(tag)]
+    for tag in events.Tags()["images"]:
+        curves[tag] = [(event.step, event.encoded_image_string) for event in events.Images(tag)]
     best = checkpoint.load_checkpoint(folder / "checkpoints" / "best.pt")
     files = sorted(str(path.relative_to(folder)) for path in (folder / "checkpoints").rglob("*"))
     return {"summary": summary, "checkpoint": content, "curves": curves, "best": best, "files": files}

@@ -4,8 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from agents.maddpg import DivergedError, check_finite
-from agents.recorder import Every, TrainingRecorder
+from agents.divergence import WATCHED, DivergedError, check_batch, check_finite, check_weights
+from agents.recorder import Every, Seconds, TrainingRecorder
 from envs import SurveillanceConfig, keys
 
 
@@ -49,3 +49,65 @@ def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
     restored = TrainingRecorder(world, 1, None)
     restored.load_state_dict(recorder.state_dict())
     assert restored.summary() == recorder.summary()
+    scalars = restored.scalars()
+    assert scalars == recorder.scalars()
+    assert scalars["train/violation_rate_depleted"] == 1 / 4  # two steps of two robots
+    assert scalars["train/violation_rate_collision"] == 2 / 4
+    again = recorder.scalars()  # a new interval
+    assert again["train/violation_rate_collision"] == 0
+    assert again["train/violations_collision"] == 2
+
+
+def test_the_best_evaluation_is_known():
+    recorder = TrainingRecorder(SurveillanceConfig(), 1, None)
+    costs = [0.5, 0.3, None, 0.4, 0.3, 0.2]
+    assert [recorder.evaluated({"coverage_cost": cost}) for cost in costs] == [True, True, False, False, False, True]
+    assert recorder.evaluation == {"coverage_cost": 0.2}
+
+
+def batch_of(**changes):
+    ones = torch.ones(2, 3, 3, 2)
+    batch = {key: ones.clone() for key in WATCHED.values()}
+    return TensorDict(batch | {WATCHED[name.replace("_", " ")]: value for name, value in changes.items()}, (2, 3))
+
+
+def test_numbers_that_are_not_finite_are_named():
+    check_batch(batch_of(), 0)
+    for name in WATCHED:
+        for bad in (float("nan"), float("inf"), -float("inf")):
+            value = torch.ones(2, 3, 3, 2)
+            value[1, 2, 0, 1] = bad
+            with pytest.raises(DivergedError, match=rf"frame 9: {name} not finite\. The last checkpoint is kept"):
+                check_batch(batch_of(**{name.replace(" ", "_"): value}), 9)
+
+
+def test_weights_that_are_not_finite_are_named():
+    net = torch.nn.Linear(2, 2)
+    check_weights(net, 0)
+    with torch.no_grad():
+        net.bias[1] = float("nan")
+    with pytest.raises(DivergedError, match="frame 3: weights bias not finite"):
+        check_weights(net, 3)
+
+
+def test_time_is_split():
+    seconds = Seconds("collect", "update")
+    outer, inner = torch.nn.Sequential(torch.nn.Identity()), torch.nn.Identity()
+    outer.append(inner)
+    seconds.watch("policy", outer)
+    seconds.watch("filter", inner)
+    outer(torch.zeros(1))
+    seconds.spent("collect")
+    inner(torch.zeros(1))
+    seconds.spent("update")  # calls outside of collection do not count
+    assert 0 < seconds.inside["filter"] < seconds.inside["policy"] < seconds.totals["collect"]
+    assert seconds.total() == seconds.totals["collect"] + seconds.totals["update"]
+    scalars = seconds.scalars(100)
+    parts = [scalars[f"time/{name}_s"] for name in ("filter", "inference", "env")]
+    assert sum(parts) == pytest.approx(scalars["time/collect_s"])
+    assert scalars["time/frames_per_second_filter"] == pytest.approx(100 / parts[0])
+    other = Seconds("collect", "update", "checkpoint")
+    other.watch("filter", inner)
+    other.load_state_dict(seconds.state_dict())
+    assert other.totals == seconds.totals | {"checkpoint": 0.0}
+    assert other.inside == {"filter": seconds.inside["filter"]}

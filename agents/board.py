@@ -1,0 +1,103 @@
+"""What TensorBoard shows of a run: scalars, histograms of energy, pictures and animations of one world, hyperparameters."""
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+from envs import keys
+from envs.animation import Painter, write_gif
+from envs.path_plot import path_figure
+from envs.rendering import Trajectory
+
+FINAL = ("eval/coverage_cost", "eval/charges_per_robot", "filter/intervention_rate", "train/return")
+"""Scalars that the HPARAMS tab compares runs by, beside the violations in training."""
+GIF_FRAMES = 50
+
+
+class Board:
+    """A run's event file; the x-axis is frames (world-steps).
+
+    Args:
+        folder: the run's folder.
+        frames: where a resumed run goes on; points that were logged later, by a process that was killed, disappear. 0 = from
+            the start.
+        config: settings for the HPARAMS tab, nested.
+        figures: draw the paths of one world at every evaluation.
+        gif: and an animation of it.
+    """
+
+    def __init__(self, folder: Path, frames: int, config: Mapping[str, Any], *, figures: bool, gif: bool) -> None:
+        self.writer = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        self.figures, self.gif = figures, gif
+        if not frames:
+            self._hyperparameters(config)
+
+    @property
+    def records(self) -> bool:
+        """Whether evaluations are to keep a world's history."""
+        return self.figures or self.gif
+
+    def scalars(self, values: Mapping[str, float], frames: int) -> None:
+        """Log numbers by tag."""
+        for tag, value in values.items():
+            self.writer.add_scalar(tag, value, frames)
+
+    def histogram(self, tag: str, values: Tensor, frames: int) -> None:
+        """Log a histogram of all entries that are finite."""
+        values = values.detach().flatten()
+        values = values[values.isfinite()]
+        if values.numel():
+            self.writer.add_histogram(tag, values.cpu(), frames, bins=50)  # pyright: ignore[reportArgumentType]
+
+    def world(self, trajectory: Trajectory | None, frames: int) -> None:
+        """Log the paths and the animation of one world."""
+        if trajectory is None:
+            return
+        if self.figures:
+            content = io.BytesIO()
+            figure = path_figure(trajectory, dpi=90)
+            figure.savefig(content, format="png")
+            width, height = figure.canvas.get_width_height()
+            self._image("world/paths", content, width, height, frames)
+        if self.gif:
+            content = io.BytesIO()
+            write_gif(trajectory, content, max_frames=GIF_FRAMES)
+            width, height = Painter(trajectory).frame(0).size
+            self._image("world/animation", content, width, height, frames)
+
+    def flush(self) -> None:
+        """Put everything logged so far on disk."""
+        self.writer.flush()
+
+    def close(self) -> None:
+        """Flush and close the file."""
+        self.writer.close()
+
+    def _image(self, tag: str, content: io.BytesIO, width: int, height: int, frames: int) -> None:
+        """An encoded picture: the writer's own functions decode and re-encode, which loses animations."""
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=content.getvalue())
+        summary = Summary(value=[Summary.Value(tag=tag, image=image)])
+        self.writer._get_file_writer().add_summary(summary, frames)
+
+    def _hyperparameters(self, config: Mapping[str, Any]) -> None:
+        """In the run's own file: ``add_hparams`` would make a run of its own, without curves."""
+        metrics = dict.fromkeys([*FINAL, *(f"train/violations_{kind}" for kind in keys.VIOLATION_KINDS)], 0.0)
+        for summary in hparams(plain(config), metrics):
+            self.writer._get_file_writer().add_summary(summary)
+
+
+def plain(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | str | float]:
+    """Nested settings as the HPARAMS tab takes them: flat names, values that are numbers, strings or truth values."""
+    flat: dict[str, bool | str | float] = {}
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            flat |= plain(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value if isinstance(value, bool | str | int | float) else str(value)
+    return flat
