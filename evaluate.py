@@ -26,6 +26,7 @@ from agents.incident import check_violations
 from agents.networks import make_actor
 from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
+from conf.command_line import clear_errors
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
 from conf.schema import Config, EvaluateConfig, register, run_config, to_config
 from conf.versions import git_hash
@@ -37,6 +38,7 @@ register()
 logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
+@clear_errors(EvaluateConfig)
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 @one_clear_error
 def main(cfg: DictConfig) -> None:

@@ -16,6 +16,7 @@ from agents.report_runs import Run, check_runs, find_runs, read_curves
 from agents.report_statistics import Bootstrap, Groups, compute_curves, compute_rows
 from agents.report_tables import Report, find_method, write_curves, write_rows, write_runs
 from conf.callbacks import one_clear_error
+from conf.command_line import clear_errors
 from conf.naming import config_hash
 from conf.report_schema import ReportConfig
 from conf.schema import register, to_config
@@ -26,6 +27,7 @@ logging.getLogger("tensorboard").setLevel(logging.ERROR)
 FILES = ("report.md", "table.csv", "runs.csv", "curves.csv", "curves.png", "curves.svg", "rates.png", "rates.svg")
 
 
+@clear_errors(ReportConfig)
 @hydra.main(version_base="1.3", config_path="conf", config_name="report")
 @one_clear_error
 def main(cfg: DictConfig) -> None:

@@ -28,6 +28,7 @@ from agents.pipeline import MultiStep, collect, make_buffer, pick_device, to_tra
 from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_state import TrainingState
 from conf.callbacks import one_clear_error
+from conf.command_line import clear_errors
 from conf.naming import hashed_config
 from conf.run_folder import announce_certificate, finished_run, write_json
 from conf.schema import Config, register, to_config
@@ -39,6 +40,7 @@ register()
 logging.getLogger("torchrl").setLevel(logging.WARNING)
 
 
+@clear_errors(Config)
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 @one_clear_error
 def main(cfg: DictConfig) -> None:
@@ -141,7 +143,7 @@ def main(cfg: DictConfig) -> None:
             if save or ends or stop.received:
                 check_weights(loss_module, recorder.frames)
                 board.flush()  # what it has logged is on disk before the checkpoint that says so
-                state.save()
+                state.save(ended=ends)
             seconds.spent("checkpoint")
             stop.check(f"at {recorder.frames} frames, checkpoint written in {folder}")
     bar.close()
@@ -153,8 +155,8 @@ def main(cfg: DictConfig) -> None:
     speed = {"wall_time_s": wall_time, "frames_per_second": recorder.frames / wall_time, "time": seconds.totals}
     kept = {"checkpoint": {"buffer": with_buffer}}
     metrics = {"eval": recorder.evaluation}
-    write_json(folder / "summary.json", origin | recorder.summary() | speed | kept | metrics)
     state.finish()
+    write_json(folder / "summary.json", origin | recorder.summary() | speed | kept | metrics)
     board.close()
     tqdm.write(f"{folder}/summary.json\n{json.dumps(recorder.evaluation, indent=2)}")
 

@@ -54,8 +54,11 @@ class TrainingState:
         self.parts, self.origin, self.keep = parts, origin, keep
         self.replay = ReplayFiles(self.folder / "replay", buffer) if with_buffer else None
 
-    def save(self) -> Path:
+    def save(self, *, ended: bool = False) -> Path:
         """Write a checkpoint; the previous ones stay until it is complete.
+
+        Args:
+            ended: the run collects no more; going on from here needs no replay rows.
 
         Raises:
             CheckpointError: if it cannot be written.
@@ -64,6 +67,7 @@ class TrainingState:
         content = {
             **self.origin,
             "frames": frames,
+            "ended": ended,
             "parts": _states(self.parts),
             "torch": torch.get_rng_state(),
             "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -114,8 +118,9 @@ class TrainingState:
         path, content = found
         own = path.parent.resolve() == self.folder.resolve()
         check_origin(path, content, self.origin, may_differ=() if own else MAY_DIFFER)
+        content["ended"] = content["ended"] and own  # a longer run goes on collecting
         with_rows = self.replay is not None and content["replay"] is not None
-        if self.replay is not None and content["replay"] is not None:
+        if self.replay is not None and content["replay"] is not None and not content["ended"]:
             self.replay.load(content["replay"], path.parent / "replay")
         _load_states(self.parts, content["parts"])
         torch.set_rng_state(content["torch"].cpu())

@@ -1,16 +1,16 @@
 """Checks before Hydra creates a folder, and errors in one message instead of a traceback."""
 
 import functools
-import os
+import shutil
 import signal
 import sys
-import textwrap
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -21,6 +21,7 @@ from agents.divergence import DivergedError
 from agents.incident import ViolationError
 from agents.interruption import InterruptedRunError
 from agents.report_runs import ReportError
+from conf.command_line import FAILED_JOBS, fail, wants_traceback
 from conf.run_folder import finished_run
 from conf.schema import check_evaluation, check_training, to_config
 
@@ -35,14 +36,6 @@ EXPECTED_IN_RUN = (
 )  # anything else is a programming error
 
 
-def fail(error: BaseException) -> None:
-    """Print one message of at most 8 lines and leave with exit code 1."""
-    text = str(error).splitlines() or [type(error).__name__]
-    lines = [line for part in text for line in textwrap.wrap(part, 110)][:7]
-    sys.stderr.write("\n".join(["error: " + lines[0], *("  " + line for line in lines[1:])]) + "\n")
-    sys.exit(1)
-
-
 class ValidateConfig(Callback):
     """Validates the composed configuration before anything is written.
 
@@ -54,17 +47,26 @@ class ValidateConfig(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Before the run folder exists."""
+        message = None
         try:
             self.check(config)
+            message = finished_run(Path(str(config.hydra.run.dir)), config.get("resume"))
         except EXPECTED as error:
             if config.get("debug", False):
                 traceback.print_exception(error)
                 sys.exit(1)
             fail(error)
-        message = finished_run(Path(str(config.hydra.run.dir)), config.get("resume"))
         if message:  # before Hydra rewrites .hydra/
             sys.stderr.write(message + "\n")
             sys.exit(0)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Remember a failed job of a multirun: Hydra itself only raises the first one's error, at the end."""
+        if job_return.status == JobStatus.FAILED and config.hydra.mode == RunMode.MULTIRUN:
+            FAILED_JOBS.append((job_return.overrides or (), job_return._return_value))
+            folder = Path(config.hydra.runtime.output_dir)
+            if {path.name for path in folder.glob("*")} <= {".hydra"}:  # refused before it began
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 class ValidateTraining(ValidateConfig):
@@ -97,7 +99,7 @@ def one_clear_error(main: Callable[[DictConfig], None]) -> Callable[[DictConfig]
             sys.exit(128 + signal.SIGINT)
         except EXPECTED_IN_RUN as error:
             multirun = HydraConfig.get().mode == RunMode.MULTIRUN
-            if multirun or cfg.get("debug", False) or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            if multirun or cfg.get("debug", False) or wants_traceback():
                 raise
             fail(error)
 

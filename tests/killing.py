@@ -23,7 +23,7 @@ RUN = (
 
 STAGES = (
     *("before", "half written", "before rename", "after rename", "after rows", "after checkpoint", "in set-aside"),
-    *("in event file", "in summary"),
+    *("in event file", "in clearing", "in summary"),
 )
 """Instants inside a write at which a process can kill itself."""
 
@@ -119,12 +119,16 @@ def _arm(stage: str, count: int) -> None:
         die(stage == "after checkpoint" and Path(target).name.startswith("frames_"))
         return found
 
+    def patched_rmdir(path, rmdir=Path.rmdir):
+        die(stage == "in clearing")
+        rmdir(path)
+
     def patched_rename(path, target, rename=Path.rename):
         found = rename(path, target)
         die(stage == "in set-aside")
         return found
 
-    torch.save, Path.replace, Path.rename = patched_save, patched_replace, patched_rename
+    torch.save, Path.replace, Path.rename, Path.rmdir = patched_save, patched_replace, patched_rename, patched_rmdir
     if stage == "in event file":
         from tensorboard.summary.writer.record_writer import RecordWriter
 

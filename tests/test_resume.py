@@ -50,7 +50,7 @@ def copy(folder: Path, target: Path) -> Path:
     ("stage", "count"),
     [
         *(("before", 9), ("half written", 9), ("before rename", 9), ("after rename", 1), ("after rows", 4)),
-        *(("after checkpoint", 10), ("in event file", 150), ("in summary", 1)),
+        *(("after checkpoint", 10), ("in event file", 150), ("in clearing", 1), ("in summary", 1)),
     ],
 )
 def test_killed_inside_a_write(tmp_path, whole, stage, count):
