@@ -2,7 +2,7 @@
 
 ``python evaluate.py run=<folder>`` writes ``<folder>/eval/<world>_<steps>_<seed>/``; ``python evaluate.py
 controller=<name> env=… safety=…`` writes a folder under ``runs/controllers/``. Both hold eval.json, the pictures of the
-paper's Figs 5-7, a GIF and the battery plot of the first world.
+paper's Figs 5-7, a GIF, the paths and the battery plot of the first world.
 """
 
 import functools
@@ -31,6 +31,7 @@ from conf.run_folder import announce_certificate, finished_evaluation, write_jso
 from conf.schema import Config, EvaluateConfig, register, run_config, to_config
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
+from envs.path_plot import save_path_plot
 from envs.rendering import save_battery_plot, save_gif, save_snapshots
 from safety import SafetyConfig, SafetyFilter
 
@@ -95,6 +96,7 @@ def main(cfg: DictConfig) -> None:
     if trajectory is not None:
         save_snapshots(trajectory, folder)
         save_battery_plot(trajectory, folder / "battery.png")
+        save_path_plot(trajectory, folder / "paths.png")
         save_gif(trajectory, folder / "world.gif", max_frames=60)
     tqdm.write(f"{folder}/eval.json\n{json.dumps(metrics | {'filter': statistics}, indent=2)}")
 

@@ -50,6 +50,7 @@ def main(cfg: DictConfig) -> None:
     if message := finished_run(folder, config.resume):  # a job of a multirun; single runs end before they get here
         tqdm.write(message)
         return
+
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
     device = pick_device(config.device)

@@ -1,16 +1,16 @@
 """Errors of the command line in a few lines, in place of Hydra's: what is wrong, what is allowed, what to do."""
 
+import contextlib
 import functools
 import os
 import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from hydra._internal.utils import get_args_parser
+from hydra._internal import utils as hydra_utils
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
@@ -59,7 +59,7 @@ def clear_errors(schema: type) -> Callable[[Callable[[], None]], Callable[[], No
                 return
             _check_flags()
             FAILED_JOBS.clear()
-            with raising():
+            with _raising():
                 try:
                     main()
                 except (HydraException, OmegaConfBaseException) as error:
@@ -78,20 +78,15 @@ def clear_errors(schema: type) -> Callable[[Callable[[], None]], Callable[[], No
     return decorate
 
 
-class raising:
-    """Context in which Hydra raises its errors instead of printing them."""
-
-    def __enter__(self) -> None:
-        """Switch Hydra's own reports off."""
-        from hydra._internal import utils
-
-        self.utils: Any = utils
-        self.before = utils.run_and_report
-        utils.run_and_report = lambda func: func()
-
-    def __exit__(self, *exception: object) -> None:
-        """And on again."""
-        self.utils.run_and_report = self.before
+@contextlib.contextmanager
+def _raising() -> Iterator[None]:
+    """Hydra raises its errors instead of printing them."""
+    before = hydra_utils.run_and_report
+    hydra_utils.run_and_report = lambda func: func()
+    try:
+        yield
+    finally:
+        hydra_utils.run_and_report = before
 
 
 def _is_hydras(error: BaseException) -> bool:
@@ -104,7 +99,7 @@ def _is_hydras(error: BaseException) -> bool:
 
 def _check_flags() -> None:
     """Refuse what begins with a dash and is no flag of Hydra's, which would print a page."""
-    parser = get_args_parser()
+    parser = hydra_utils.get_args_parser()
     parser.error = lambda message: fail(f"{message}. {QUOTING}")  # pyright: ignore[reportAttributeAccessIssue]
     _, unknown = parser.parse_known_args()
     if unknown:
@@ -129,9 +124,8 @@ def describe(error: BaseException, schema: type) -> str:
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} is not an override: {' '.join(str(error).split('See https')[0].split())}\n{QUOTING}"
     if isinstance(error, MissingConfigException):
-        options = [
-            line.strip() for line in text.split("Available options in")[-1].splitlines()[1:] if line.startswith("\t")
-        ]
+        listed = [line.strip() for line in text.split("Available options in")[-1].splitlines()[1:]]
+        options = [name for name in listed if re.fullmatch(r"[\w-]+", name)]
         named = re.search(r"'([^']+/[^']+|[^']+)'(?=\s*$|\n)", text.splitlines()[0])
         group, _, option = (error.missing_cfg_file or (named.group(1) if named else "")).rpartition("/")
         known = f" Choose one of {', '.join(options)}." if options else ""

@@ -102,7 +102,7 @@ def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
     result = json.loads((target / "eval.json").read_text())
     assert result["robot_steps"] == 3 * 3 * 30
     assert "intervention_rate" in result["filter"]
-    for name in ("surveying_1.png", "charging.png", "surveying_2.png", "battery.png", "world.gif"):
+    for name in ("surveying_1.png", "charging.png", "surveying_2.png", "battery.png", "paths.png", "world.gif"):
         with Image.open(target / name) as picture:
             assert picture.size[0] > 300
 
