@@ -152,7 +152,7 @@ def test_a_damaged_checkpoint_that_is_asked_for_is_refused(program, tmp_path, ki
     flip(asked)
     code, output = program(train.main, *RUN, f"resume={asked}", f"hydra.run.dir={tmp_path}/other")
     assert code == 1
-    assert "cannot be read" in output
+    assert "cannot be read" in " ".join(output.split())
     assert "frames_000000000384.pt" in " ".join(output.split())
     assert "Traceback" not in output
     assert set(tmp_path.rglob("*")) == before
@@ -168,18 +168,16 @@ def test_missing_or_damaged_rows_are_refused(program, tmp_path, killed):
     flip(rows[-1])
     code, output = program(train.main, *RUN, f"hydra.run.dir={folder}")
     assert code == 1
-    assert (
-        f"checkpoint {rows[-1]} cannot be read" in " ".join(output.split()).replace(" rows_", "rows_")
-        or "rows_" in output
-    )
+    assert rows[-1].name in "".join(output.split())  # a long path is wrapped
+    assert "cannot be read" in " ".join(output.split())
     rows[-1].unlink()
     code, output = program(train.main, *RUN, f"hydra.run.dir={folder}")
     assert code == 1
-    assert "lacks the replay rows" in output
+    assert "lacks the replay rows" in " ".join(output.split())
     assert "checkpoint.buffer=false" in " ".join(output.split())
     code, output = program(train.main, *RUN, f"hydra.run.dir={folder}", "checkpoint.buffer=false")
     assert code == 0, output
-    assert "the replay buffer starts empty" in output
+    assert "the replay buffer starts empty" in " ".join(output.split())
     assert json.loads((folder / "summary.json").read_text())["checkpoint"] == {"buffer": False}
 
 
