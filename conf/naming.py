@@ -11,6 +11,7 @@ from agents.evaluation import rollout_steps
 
 # Settings that do not change what is computed by a run of a given seed.
 NOT_HASHED = ("seed", "device", "threads", "deterministic", "resume", "debug", "checkpoint", "log", "hydra", "folder")
+NOT_HASHED += ("video", "format", "samples")  # of evaluate.py's pictures
 
 
 def config_hash(cfg: DictConfig) -> str:

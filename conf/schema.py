@@ -19,6 +19,7 @@ from conf.naming import config_hash, evaluation_folder, hashed_config
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
+from envs.video import check_mp4
 from safety import SafetyConfig
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -238,7 +239,14 @@ class EvaluateConfig:
     threads: int = 1
     """CPU threads, 0..1024; 0 = PyTorch's choice. One is fastest for tensors of this size, by a factor of 4 on 2 cores."""
     pictures: bool = True
-    """Write pictures and the GIF of the first world, not only eval.json."""
+    """Write pictures and a video of the first world, not only eval.json."""
+    format: str = "png"
+    """png | pdf | svg: format of the pictures; the last two are vector graphics, for papers."""
+    video: str = "gif"
+    """gif (60 frames) | mp4 (every sample, 25 a second; needs pip install -e '.[video]') | both | none."""
+    samples: int = 2000
+    """Samples of the first world that pictures and videos show, evenly spread over the rollout, 1..1e6. A rollout of fewer
+    steps shows every step."""
     restart: bool = False
     """Draw a world anew after a violation and go on counting in it; otherwise it counts until its first one."""
     compile: bool = False
@@ -256,6 +264,13 @@ class EvaluateConfig:
         check_range("steps", self.steps, 0, 10**9)
         check_range("num_envs", self.num_envs, 1, 10**6)
         check_choice("resume", self.resume, ("auto", "never"))
+        check_choice("format", self.format, ("png", "pdf", "svg"))
+        check_choice("video", self.video, ("gif", "mp4", "both", "none"))
+        check_range("samples", self.samples, 1, 10**6)
+        if self.video in ("mp4", "both"):
+            if not self.pictures:
+                raise ValueError(f"video={self.video} is one of the pictures: it needs pictures=true.")
+            check_mp4()
         if (self.run is None) == (self.controller is None):
             raise ValueError(
                 f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>."
