@@ -27,8 +27,9 @@ from agents.networks import make_actor
 from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
+from conf.evaluate_schema import EvaluateConfig
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
-from conf.schema import Config, EvaluateConfig, register, run_config, to_config
+from conf.schema import Config, register, run_config, to_config
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.path_plot import save_path_plot

@@ -29,7 +29,7 @@ from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_state import TrainingState
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
-from conf.naming import hashed_config
+from conf.naming import compared_settings, hashed_config
 from conf.run_folder import announce_certificate, finished_run, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
@@ -98,7 +98,7 @@ def main(cfg: DictConfig) -> None:
     kept_rows = state.resume(config.resume, tqdm.write)
     resumed_at = recorder.frames
     learn_from = config.train.warmup_frames + (0 if kept_rows else resumed_at)
-    settings = hashed_config(cfg) | {"seed": config.seed}
+    settings = compared_settings(cfg, HydraConfig.get().runtime.choices)
     board = Board(folder, resumed_at, settings, figures=config.log.figures, gif=config.log.gif)
     announce_certificate(folder, config.env)
     seconds.spent("build")

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from agents.evaluation import rollout_steps
 NOT_HASHED = ("seed", "device", "threads", "deterministic", "resume", "debug", "checkpoint", "log", "hydra", "folder")
 NOT_HASHED += ("video", "format", "samples")  # of evaluate.py's pictures
 
+GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
+
 
 def config_hash(cfg: DictConfig) -> str:
     """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
@@ -22,6 +25,17 @@ def config_hash(cfg: DictConfig) -> str:
 def hashed_config(cfg: DictConfig) -> dict:
     """The resolved configuration without :data:`NOT_HASHED`, nested."""
     return {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
+
+
+def compared_settings(cfg: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
+    """What TensorBoard's HPARAMS tab compares runs by: seed, the file chosen in each group, and :func:`hashed_config`, nested.
+
+    Args:
+        cfg: the composed configuration.
+        choices: Hydra's, by group.
+    """
+    groups = {f"group.{group}": choices[group] for group in GROUPS}
+    return {"seed": cfg.seed} | groups | hashed_config(cfg)
 
 
 def _plain(cfg: DictConfig, name: str) -> Any:

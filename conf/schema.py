@@ -1,28 +1,26 @@
-"""Typed root configuration of train.py and evaluate.py, its checks, and the registration of all schemas with Hydra."""
+"""Typed root configuration of train.py, its checks, and the registration of all schemas with Hydra."""
 
+import re
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import AgentConfig, make_controller
 from agents.adversary_reward import BARRIERS, AdversaryReward
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
-from agents.controllers import CONTROLLERS
 from agents.maddpg import check_loss
-from agents.pipeline import pick_device
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
+from conf.evaluate_schema import EvaluateConfig, check_common
 from conf.manual import explain, manual
-from conf.naming import config_hash, evaluation_folder, hashed_config
+from conf.naming import GROUPS, config_hash, evaluation_folder, hashed_config
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.config import check_choice, check_range
-from envs.video import check_mp4
 from safety import SafetyConfig
-
-DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass
@@ -190,7 +188,7 @@ class Config:
 
     def __post_init__(self) -> None:
         """Check the combinations that no group can check alone."""
-        _check_common(self)
+        check_common(self)
         if self.resume not in ("auto", "never") and not Path(self.resume).exists():
             raise ValueError(
                 f"resume={self.resume} is neither auto nor never, and no such file or folder exists: give a checkpoint "
@@ -214,87 +212,6 @@ class Config:
         return AdversaryReward(self.env, self.safety, self.train.attack)
 
 
-@dataclass
-class EvaluateConfig:
-    """Everything that evaluate.py needs: either a run or a controller."""
-
-    run: str | None = None
-    """Folder of a training run (its world and filter are used, with env.* and safety.* overrides applied to them)."""
-    controller: str | None = None
-    """Name of a controller."""
-    adversary: str | None = None
-    """controller=learned: folder of the run that trained it (newest checkpoint); null = the one shipped, for the default world."""
-    checkpoint: str | None = None
-    """File in the run's checkpoints folder, such as frames_000000100000.pt; null = the newest."""
-    folder: str = "runs/controllers"
-    """controller: where the folders of its evaluations go (a run's are in the run's own folder)."""
-    steps: int = 0
-    """Length of the rollout; 0 = the world's horizon (1000 where it has none)."""
-    num_envs: int = 64
-    """Worlds, 1..1e6."""
-    seed: int = 0
-    """Seed of the start states and of the controller, 0..2^31."""
-    device: str = "auto"
-    """auto | cpu | cuda."""
-    threads: int = 1
-    """CPU threads, 0..1024; 0 = PyTorch's choice. One is fastest for tensors of this size, by a factor of 4 on 2 cores."""
-    pictures: bool = True
-    """Write pictures and a video of the first world, not only eval.json."""
-    format: str = "png"
-    """png | pdf | svg: format of the pictures; the last two are vector graphics, for papers."""
-    video: str = "gif"
-    """gif (60 frames) | mp4 (every sample, 25 a second; needs pip install -e '.[video]') | both | none."""
-    samples: int = 2000
-    """Samples of the first world that pictures and videos show, evenly spread over the rollout, 1..1e6. A rollout of fewer
-    steps shows every step."""
-    restart: bool = False
-    """Draw a world anew after a violation and go on counting in it; otherwise it counts until its first one."""
-    compile: bool = False
-    """As train.py's: run the pure tensor functions of step and shield through torch.compile."""
-    resume: str = "never"
-    """auto: an evaluation that has its eval.json is left alone, so that a killed sweep goes on. never: evaluate anew."""
-    debug: bool = False
-    """Show tracebacks."""
-    env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-
-    def __post_init__(self) -> None:
-        """Check every field."""
-        _check_common(self)
-        check_range("steps", self.steps, 0, 10**9)
-        check_range("num_envs", self.num_envs, 1, 10**6)
-        check_choice("resume", self.resume, ("auto", "never"))
-        check_choice("format", self.format, ("png", "pdf", "svg"))
-        check_choice("video", self.video, ("gif", "mp4", "both", "none"))
-        check_range("samples", self.samples, 1, 10**6)
-        if self.video in ("mp4", "both"):
-            if not self.pictures:
-                raise ValueError(f"video={self.video} is one of the pictures: it needs pictures=true.")
-            check_mp4()
-        if (self.run is None) == (self.controller is None):
-            raise ValueError(
-                f"run={self.run} controller={self.controller}: give one of run=<folder> and controller=<name>."
-            )
-        if self.controller is not None:
-            check_choice("controller", self.controller, tuple(CONTROLLERS))
-        if self.adversary is not None and self.controller != "learned":
-            raise ValueError(f"adversary={self.adversary} goes with controller=learned, not with {self.controller}.")
-        for name in ("run", "adversary"):
-            folder = getattr(self, name)
-            if folder is not None and not (Path(folder) / ".hydra" / "config.yaml").is_file():
-                raise ValueError(
-                    f"{name}={folder} is not the folder of a run: {folder}/.hydra/config.yaml does not exist."
-                )
-        self.safety.gains(self.env)
-
-
-def _check_common(config: Any) -> None:
-    check_range("seed", config.seed, 0, 2**31)
-    check_choice("device", config.device, DEVICES)
-    check_range("threads", config.threads, 0, 1024)
-    pick_device(config.device)  # refuses cuda where there is none, before a folder exists
-
-
 def register() -> None:
     """Tell Hydra the schemas and the resolvers that name the run folders."""
     store = ConfigStore.instance()
@@ -313,6 +230,7 @@ def to_config(cfg: DictConfig) -> Any:
     Raises:
         ValueError: naming the value, what is allowed and the remedy.
     """
+    _check_groups(cfg)
     own = cfg.copy()
     with open_dict(own):
         own.pop("hydra", None)
@@ -320,6 +238,15 @@ def to_config(cfg: DictConfig) -> Any:
     if "run" in own and own.run is not None:  # world and filter are the run's: run_config applies the overrides to them
         own.env, own.safety = OmegaConf.structured(SurveillanceConfig), OmegaConf.structured(SafetyConfig)
     return OmegaConf.to_object(own)
+
+
+def _check_groups(cfg: DictConfig) -> None:
+    """Refuse a deleted group (~agent): without its file every option of it would silently be the schema's default."""
+    hydra = cfg.get("hydra") or (HydraConfig.get() if HydraConfig.initialized() else None)
+    for override in hydra.overrides.task if hydra is not None else ():
+        group = re.split("[=@]", str(override))[0]
+        if group.startswith("~") and group[1:] in GROUPS:
+            raise ValueError(f"{override}: groups cannot be deleted; choose a file of it with {group[1:]}=<name>.")
 
 
 def _check_names(cfg: DictConfig, prefix: str = "") -> None:

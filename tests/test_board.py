@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.hparams.backend_context import Context as BackendContext
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import train
@@ -78,10 +83,26 @@ def test_hyperparameters_stand_in_the_runs_own_file(events, tmp_path):
     assert start.hparams["agent.actor_lr"].number_value == 0.002
     assert start.hparams["env.n_agents"].number_value == 3
     assert start.hparams["seed"].number_value == 0
-    experiment = HParamsPluginData.FromString(content["_hparams_/experiment"]).experiment
-    metrics = {info.name.tag for info in experiment.metric_infos}
-    assert "eval/coverage_cost" in metrics
-    assert metrics <= set(events.Tags()["scalars"]) | {"train/return"}
+    assert start.hparams["group.experiment"].string_value == "smoke"
+    assert start.hparams["group.method"].string_value == "default"
+    assert "_hparams_/experiment" not in content  # it would fix one run's columns, in alphabetical order, for all
+
+
+def test_settings_that_differ_come_first_in_the_table(tmp_path):
+    """As TensorBoard's own plugin answers the page."""
+    for k, rate in enumerate((0.1, 0.2, 0.1)):
+        board = Board(
+            tmp_path / str(k), 0, {"a": 1, "seed": k, "x": {"rate": rate}, "z": "y"}, figures=False, gif=False
+        )
+        board.scalars({"eval/coverage_cost": 0.3 + k, "train/return": -1.0}, 10)
+        board.close()
+    multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    provider = MultiplexerDataProvider(multiplexer, str(tmp_path))
+    request, backend = RequestContext(), BackendContext(TBContext(data_provider=provider, logdir=str(tmp_path)))
+    found = backend.experiment_from_metadata(request, "", True, backend.hparams_metadata(request, ""), None)
+    columns = [info.name for info in found.hparam_infos]
+    assert columns == ["seed", "x.rate", "a", "z"]
+    assert {info.name.tag for info in found.metric_infos} == {"eval/coverage_cost", "train/return"}
 
 
 def test_pictures_can_be_left_out(program, tmp_path):
