@@ -21,7 +21,8 @@ class EvaluateConfig:
     run: str | None = None
     """Folder of a training run (its world and filter are used, with env.* and safety.* overrides applied to them)."""
     controller: str | None = None
-    """Name of a controller."""
+    """Tasks: lloyd | charge_when_low | coverage_cbf | coverage_cbf_literal | patrol. Adversaries: random | ou | flee | gather |
+    swap | chatter | block | tangential | chase | certificate_descent | mixture | nan | learned."""
     adversary: str | None = None
     """controller=learned: folder of the run that trained it (newest checkpoint); null = the one shipped, for the default world."""
     checkpoint: str | None = None

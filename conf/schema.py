@@ -15,7 +15,7 @@ from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, wor
 from agents.maddpg import check_loss
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig, check_common
-from conf.manual import explain, manual
+from conf.manual import explain, groups, manual
 from conf.naming import GROUPS, config_hash, evaluation_folder, hashed_config
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
@@ -221,6 +221,7 @@ def register() -> None:
     OmegaConf.register_new_resolver("config_hash", lambda *, _root_: config_hash(_root_), replace=True)
     schemas = {"train": Config, "evaluate": EvaluateConfig, "report": ReportConfig}
     OmegaConf.register_new_resolver("manual", lambda program: manual(schemas[program]), replace=True)
+    OmegaConf.register_new_resolver("groups", lambda *names: groups(*names), replace=True)
     OmegaConf.register_new_resolver("evaluation_folder", lambda *, _root_: evaluation_folder(_root_), replace=True)
 
 
