@@ -23,6 +23,8 @@ from agents.evaluation import rollout_steps
 # Overrides that belong to the world or to no method: they do not name one.
 UNNAMED = {
     "seed",
+    "seeds",
+    "n_seeds",
     "env",
     "device",
     "threads",
@@ -93,11 +95,17 @@ def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run
 def _run_folders(sweep: Path) -> Iterable[Path]:
     for path, names, _ in os.walk(sweep):
         folder = Path(path)
-        if (folder / ".hydra" / "config.yaml").is_file():
+        if (folder / ".hydra" / "config.yaml").is_file() and not _of_several_seeds(folder):
             names.clear()
             yield folder
         else:
             names[:] = [name for name in names if not re.fullmatch(r"replaced_\d+|\..*", name)]
+
+
+def _of_several_seeds(folder: Path) -> bool:
+    """Whether the folder is that of a program whose runs have folders of their own."""
+    config = OmegaConf.load(folder / ".hydra" / "config.yaml")
+    return config.get("seeds") is not None or config.get("n_seeds", 1) > 1
 
 
 def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]) -> Run | None:

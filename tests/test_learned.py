@@ -16,7 +16,7 @@ from agents.checkpoint import CheckpointError, load_checkpoint
 from agents.learned import SHIPPED, actor_layers, export_actor
 from agents.networks import make_actor
 from agents.pipeline import STORED, to_transitions
-from conf.schema import TrainConfig
+from agents.training_config import TrainConfig
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
