@@ -18,7 +18,7 @@ from tqdm import tqdm
 from agents.interruption import StopSignals
 from agents.learners import LearnerStack, make_learners
 from agents.maddpg import update_step
-from agents.networks import make_policies
+from agents.networks import ExplorationNoise, make_policies
 from agents.pipeline import collect, pick_device, use_threads
 from agents.recorder import Seconds
 from agents.run import TrainingRun, begin_together, check_seeds, for_each, minibatch, seeds_of_streams
@@ -57,7 +57,7 @@ def main(cfg: DictConfig) -> None:
     learners, learner = make_learners(env.n_observation, world, config.agent, safety, device, seeds=list(folders))
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
     (_, safety_filter), explore_policy = policies
-    noises = list(explore_policy[1].children())  # one per seed
+    noises = [module for module in explore_policy.modules() if isinstance(module, ExplorationNoise)]  # one per seed
     seconds.watch("policy", explore_policy)
     seconds.watch("filter", safety_filter)
     origin, settings = run_origin(cfg, device) | {"n_seeds": len(folders)}, hashed_config(cfg)
