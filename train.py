@@ -19,16 +19,16 @@ from agents.interruption import StopSignals
 from agents.learners import LearnerStack, make_learners
 from agents.maddpg import update_step
 from agents.networks import ExplorationNoise, make_policies
-from agents.pipeline import collect, pick_device, use_threads
+from agents.pipeline import MultiStep, collect, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds
-from agents.run import TrainingRun, begin_together, check_seeds, for_each, minibatch, seeds_of_streams
+from agents.run import TrainingRun, begin_together, check_seeds, for_each, minibatch, seeds_of_streams, shares
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
 from conf.naming import hashed_config
 from conf.run_folder import announce_certificate, unfinished_seeds, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
-from envs import SurveillanceEnv
+from envs import SurveillanceEnv, keys
 
 register()
 logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -58,6 +58,8 @@ def main(cfg: DictConfig) -> None:
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
     (_, safety_filter), explore_policy = policies
     noises = [module for module in explore_policy.modules() if isinstance(module, ExplorationNoise)]  # one per seed
+    multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
+    adversary = config.adversary_reward()
     seconds.watch("policy", explore_policy)
     seconds.watch("filter", safety_filter)
     origin, settings = run_origin(cfg, device) | {"n_seeds": len(folders)}, hashed_config(cfg)
@@ -66,6 +68,7 @@ def main(cfg: DictConfig) -> None:
             *(folder, config, seed, origin | {"seed": seed}, settings),
             learner=learners[k],
             worlds=env.blocks[k],
+            waiting=multi_step.blocks[k],
             noise=noises[k],
             policy=TensorDictSequential(learners[k].actor, safety_filter),
             eval_env=eval_env,
@@ -93,7 +96,9 @@ def main(cfg: DictConfig) -> None:
     bar = tqdm(total=total, initial=start * n_runs, unit="frame", unit_scale=True, mininterval=interval)
     with StopSignals() as stop:
         for batch in collect(env, explore_policy, per_batch * n_runs, frames * n_runs, resumed=start > 0):
-            for_each(runs, TrainingRun.take, batch.chunk(n_runs))
+            transitions = to_transitions(batch, config.train.violation_penalty, adversary)
+            parts = (batch, multi_step(transitions), transitions["next"][keys.REWARD])
+            for_each(runs, TrainingRun.take, *(shares(part, runs) for part in parts))
             seconds.spent("collect")
             if any(run.learns for run in runs):
                 for _ in range(config.train.n_updates):

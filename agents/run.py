@@ -17,7 +17,7 @@ from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
 from agents.networks import ExplorationNoise
-from agents.pipeline import MultiStep, make_buffer, to_transitions
+from agents.pipeline import WaitingSteps, make_buffer
 from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_config import Config
 from agents.training_state import TrainingState
@@ -49,6 +49,7 @@ class TrainingRun:
         settings: the hashed configuration, nested.
         learner: its networks and optimisers.
         worlds: its worlds.
+        waiting: its steps that wait for n-step transitions.
         noise: its exploration noise.
         policy: deployment policy of its networks.
         eval_env: the worlds of evaluations, shared by all runs.
@@ -65,6 +66,7 @@ class TrainingRun:
         *,
         learner: Learner,
         worlds: WorldBlock,
+        waiting: WaitingSteps,
         noise: ExplorationNoise,
         policy: TensorDictSequential,
         eval_env: SurveillanceEnv,
@@ -78,7 +80,6 @@ class TrainingRun:
         device, agent = eval_env.device, config.agent
         minibatches = config.env.n_agents if agent.minibatch == "per_agent" else 1
         self.buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
-        self.multi_step = MultiStep(agent.n_steps, agent.gamma)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),
@@ -87,12 +88,11 @@ class TrainingRun:
             "save_episodes": Every(config.checkpoint.interval_episodes),
         }
         parts = {"actor": learner.actor, "loss": learner.loss, "optimizers": learner.optimizers, "env": worlds}
-        parts |= {"noise": noise, "multi_step": self.multi_step, "recorder": self.recorder, "clocks": self.clocks}
+        parts |= {"noise": noise, "multi_step": waiting, "recorder": self.recorder, "clocks": self.clocks}
         parts |= {"seconds": seconds}
         made_for = {"config": settings, "world": world_sizes(eval_env)}
         keep, with_buffer = config.checkpoint.keep, config.checkpoint.buffer
         self.state = TrainingState(folder, parts, self.buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
-        self.adversary = config.adversary_reward()
         self.check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
         self.learns_from = config.train.warmup_frames
         self.progress = ""
@@ -117,15 +117,24 @@ class TrainingRun:
         if self.recorder.evaluated(metrics | {"filter": statistics}):
             self.state.save_best()
 
-    def take(self, batch: TensorDictBase) -> None:
-        """Count a collected batch ``(num_envs, T)``, check it and store its transitions."""
+    def take(self, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
+        """Count a collected batch, check it and store its transitions.
+
+        Args:
+            batch: ``(num_envs, T)``.
+            steps: ``(M,)``, what :class:`agents.pipeline.MultiStep` made of it.
+            rewards: ``(num_envs, T, N, 1)``, those of the objective.
+
+        Raises:
+            DivergedError: if an observation, action or reward is not finite.
+            ViolationError: at a violation behind the certified filter.
+        """
         self.recorder.update(batch)
         self.check(batch)
         check_batch(batch, self.recorder.frames)
-        transitions = to_transitions(batch, self.config.train.violation_penalty, self.adversary)
-        if len(steps := self.multi_step(transitions)):
+        if len(steps):
             self.buffer.extend(steps)
-        self.batch, self.rewards = batch, transitions["next"][keys.REWARD]
+        self.batch, self.rewards = batch, rewards
 
     @property
     def learns(self) -> bool:
@@ -251,6 +260,11 @@ def for_each(runs: Sequence[TrainingRun], act: Callable[..., object], *arguments
             run.error = error
             if all(other.error is not None for other in runs):
                 raise
+
+
+def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequence:
+    """Each run's part of ``rows``, which hold the runs' worlds one after the other."""
+    return rows.chunk(len(runs)) if len(rows) else [rows] * len(runs)
 
 
 def minibatch(runs: Sequence[TrainingRun]) -> TensorDictBase:
