@@ -62,7 +62,7 @@ def main(cfg: DictConfig) -> None:
     adversary = config.adversary_reward()
     seconds.watch("policy", explore_policy)
     seconds.watch("filter", safety_filter)
-    origin, settings = run_origin(cfg, device) | {"n_seeds": len(folders)}, hashed_config(cfg)
+    origin, settings = run_origin(cfg, device), hashed_config(cfg)
     runs = [
         TrainingRun(
             *(folder, config, seed, origin | {"seed": seed}, settings),
@@ -121,7 +121,7 @@ def main(cfg: DictConfig) -> None:
 
     # ---- conclude
     for_each(runs, TrainingRun.conclude)
-    for_each(runs, lambda run: write_json(run.folder / "summary.json", run.summary(seconds)))
+    for_each(runs, lambda run: write_json(run.folder / "summary.json", run.summary(seconds, n_runs)))
     for run in runs:
         run.board.close()
         tqdm.write(f"{run.folder}/summary.json\n{json.dumps(run.recorder.evaluation, indent=2)}")

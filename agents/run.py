@@ -201,10 +201,11 @@ class TrainingRun:
         save_training_curve(curves, self.folder / "figures" / "training.png")
         self.state.finish()
 
-    def summary(self, seconds: Seconds) -> dict:
-        """The content of summary.json."""
+    def summary(self, seconds: Seconds, n_seeds: int) -> dict:
+        """The content of summary.json; the time is that of the program, which trained ``n_seeds`` runs."""
         wall_time, frames = seconds.total(), self.recorder.frames
         speed = {"wall_time_s": wall_time, "frames_per_second": frames / wall_time, "time": seconds.totals}
+        speed |= {"n_seeds": n_seeds}
         kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}}
         return self.origin | self.recorder.summary() | speed | kept | {"eval": self.recorder.evaluation}
 
