@@ -34,6 +34,12 @@ def log(folder, seed, points, first=0.0, name="events.out.tfevents.1"):
     events.rename(folder / name)  # files are read in the order of their names
 
 
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch):
+    """The report's texts and tables are compared; drawing takes longer than all the rest."""
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+
+
 @pytest.fixture
 def sweep(tmp_path):
     """Two trained runs with long curves, one of them resumed, one without events, three controllers, and what is not kept."""
