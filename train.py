@@ -57,8 +57,10 @@ def main(cfg: DictConfig) -> None:
     use_threads(config.threads, deterministic=config.deterministic)
     env_seed, noise_seed, buffer_seed, eval_seed = np.random.SeedSequence(config.seed).generate_state(4).tolist()
     torch.manual_seed(config.seed)
-    env = SurveillanceEnv(config.env, config.collector.num_envs, device, seed=env_seed, compile=config.compile)
-    eval_env = SurveillanceEnv(config.env, config.eval.num_envs, device, compile=config.compile)
+    env = SurveillanceEnv(
+        config.env, config.collector.num_envs, device, seed=env_seed, compile_functions=config.compile
+    )
+    eval_env = SurveillanceEnv(config.env, config.eval.num_envs, device, compile_functions=config.compile)
     actor = make_actor(env.n_observation, config.env, config.agent).to(device)
     critic = make_critic(env.n_observation, config.env, config.agent).to(device)
     policies = make_policies(actor, config.env, config.safety, config.agent, noise_seed, device, compile=config.compile)

@@ -38,7 +38,7 @@ class SurveillanceEnv(EnvBase):
         num_envs: number of worlds B, >= 1.
         device: where the state lives.
         seed: seed of the environment's own random generator.
-        compile: run transition and violation counting through torch.compile; same results to rounding.
+        compile_functions: run transition and violation counting through torch.compile; same results to rounding.
 
     Raises:
         ValueError: if ``num_envs < 1``.
@@ -51,7 +51,7 @@ class SurveillanceEnv(EnvBase):
         device: torch.device | str | None = None,
         seed: int | None = 0,
         *,
-        compile: bool = False,  # the command line's word
+        compile_functions: bool = False,  # TorchRL takes the word compile for itself: all of a step, TensorDicts too
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
@@ -65,8 +65,8 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
-        self._transition = compiled(functools.partial(transition, config=config), enabled=compile)
-        self._violations = compiled(functools.partial(violations, config=config), enabled=compile)
+        self._transition = compiled(functools.partial(transition, config=config), enabled=compile_functions)
+        self._violations = compiled(functools.partial(violations, config=config), enabled=compile_functions)
         self.reference_cost = self.density.reference_cost()
         self.generator = torch.Generator(device=device)
         self._make_specs()
