@@ -20,7 +20,7 @@ train: venv
 	$(BIN)/python train.py $(ARGS)
 
 test: venv
-	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 $(ARGS)
+	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 
 lint: venv
 	$(BIN)/ruff check .

@@ -51,6 +51,12 @@ def messages(output):
     return " ".join(output.split())
 
 
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Drawing takes most of a report's time; for reports of which only numbers and texts are looked at."""
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
+
+
 # ---- statistics
 
 
@@ -172,6 +178,7 @@ def test_numbers_by_hand(program, sweep):
     assert "coverage_cbf + certified" in (sweep / "report" / "curves.svg").read_text()  # the reference's line
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_csv_files_read_back(program, sweep):
     code, output = program(report.main, "sweep=sweep", "resamples=100")
     assert code == 0, output
@@ -211,7 +218,7 @@ def test_one_seed_has_no_interval(program, tmp_path):
     assert all(row["low"] == "" for row in read(tmp_path / "sweep/report/curves.csv"))
 
 
-def test_several_worlds(program, tmp_path):
+def test_several_worlds(program, tmp_path, monkeypatch):
     sweep, cbf = tmp_path / "sweep", "coverage_cbf + certified"
     for seed in range(2):
         for world, cost in (("default", 2.0), ("aerial", 20.0)):
@@ -233,12 +240,14 @@ def test_several_worlds(program, tmp_path):
     assert "left out: only_here" in text
 
     write_run(sweep, 0, 5.0, "env.n_agents=5", method="maddpg", name="larger")  # another world, without the reference
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
     code, output = program(report.main, "sweep=sweep", "resamples=300")
     assert code == 0, output
     assert float(table(sweep)["default n_agents=5", "maddpg", "coverage_cost.iqm", ""]["value"]) == 5.0
     assert f"The reference {cbf} does not have runs in every world" in (sweep / "report/report.md").read_text()
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_what_lies_in_a_run_is_no_run(program, sweep):
     run = sweep / "deep" / "default_agent=ddpg_0"
     write_run(run / "replaced_1", 0, 77.0, "agent=ddpg", name=".")
@@ -341,6 +350,7 @@ def test_errors_of_the_command_line(program, tmp_path, sweep, arguments, expecte
     assert set(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_incomplete_reports_what_there_is_and_says_so(program, sweep):
     write_run(sweep, 8, None, "agent=ddpg", name="killed")
     write_run(sweep, 0, 1.0, "agent=new")
