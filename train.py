@@ -52,8 +52,8 @@ def main(cfg: DictConfig) -> None:
     streams = [seeds_of_streams(seed) for seed in folders]
     env_seeds, noise_seeds = [own[0] for own in streams], [own[1] for own in streams]
     num_envs, world, safety = config.collector.num_envs, config.env, config.safety
-    env = SurveillanceEnv(world, len(folders) * num_envs, device, seed=env_seeds, compile=config.compile)
-    eval_env = SurveillanceEnv(world, config.eval.num_envs, device, compile=config.compile)
+    env = SurveillanceEnv(world, len(folders) * num_envs, device, seed=env_seeds, compile_functions=config.compile)
+    eval_env = SurveillanceEnv(world, config.eval.num_envs, device, compile_functions=config.compile)
     learners, learner = make_learners(env.n_observation, world, config.agent, safety, device, seeds=list(folders))
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
     (_, safety_filter), explore_policy = policies

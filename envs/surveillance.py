@@ -41,7 +41,7 @@ class SurveillanceEnv(EnvBase):
         device: where the state lives.
         seed: seed of the environment's own random generator. Several seeds split the worlds into that many equal blocks with a
             generator each (:mod:`envs.blocks`).
-        compile: run transition and violation counting through torch.compile; same results to rounding.
+        compile_functions: run transition and violation counting through torch.compile; same results to rounding.
 
     Raises:
         ValueError: if ``num_envs < 1``, or no multiple of the number of seeds.
@@ -54,7 +54,7 @@ class SurveillanceEnv(EnvBase):
         device: torch.device | str | None = None,
         seed: int | Sequence[int] | None = 0,
         *,
-        compile: bool = False,  # the command line's word
+        compile_functions: bool = False,  # TorchRL takes the word compile for itself: all of a step, TensorDicts too
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
@@ -71,8 +71,8 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
-        self._transition = compiled(functools.partial(transition, config=config), enabled=compile)
-        self._violations = compiled(functools.partial(violations, config=config), enabled=compile)
+        self._transition = compiled(functools.partial(transition, config=config), enabled=compile_functions)
+        self._violations = compiled(functools.partial(violations, config=config), enabled=compile_functions)
         self.reference_cost = self.density.reference_cost()
         self.n_blocks = len(seeds)
         self.blocks = [WorldBlock(self, k, torch.Generator(device=device)) for k in range(len(seeds))]
