@@ -54,7 +54,7 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile=config.compile)
+    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile_functions=config.compile)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)

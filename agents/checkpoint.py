@@ -143,6 +143,11 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("frames_*.pt"))
 
 
+def frames_of(path: Path) -> int:
+    """World-steps that the run had collected, by a checkpoint's name."""
+    return int(path.stem.removeprefix("frames_"))
+
+
 def latest_checkpoint(run: Path) -> Path:
     """Newest checkpoint of a run folder.
 

@@ -21,8 +21,9 @@ from agents.divergence import DivergedError
 from agents.incident import ViolationError
 from agents.interruption import InterruptedRunError
 from agents.report_runs import ReportError
+from agents.run import SeedsFailedError
 from conf.command_line import FAILED_JOBS, fail, wants_traceback
-from conf.run_folder import finished_run
+from conf.run_folder import finished_program
 from conf.schema import check_evaluation, check_training, to_config
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
@@ -30,6 +31,7 @@ EXPECTED_IN_RUN = (
     CheckpointError,
     DivergedError,
     ReportError,
+    SeedsFailedError,
     ViolationError,
     OSError,
     OmegaConfBaseException,
@@ -50,7 +52,7 @@ class ValidateConfig(Callback):
         message = None
         try:
             self.check(config)
-            message = finished_run(Path(str(config.hydra.run.dir)), config.get("resume"))
+            message = self.finished(config)
         except EXPECTED as error:
             if config.get("debug", False):
                 traceback.print_exception(error)
@@ -59,6 +61,11 @@ class ValidateConfig(Callback):
         if message:  # before Hydra rewrites .hydra/
             sys.stderr.write(message + "\n")
             sys.exit(0)
+
+    @staticmethod
+    def finished(cfg: DictConfig) -> str | None:
+        """What to say where there is nothing left to do."""
+        return None
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Remember a failed job of a multirun: Hydra itself only raises the first one's error, at the end."""
@@ -73,6 +80,7 @@ class ValidateTraining(ValidateConfig):
     """The same for train.py, with the checkpoint that ``resume`` names."""
 
     check = staticmethod(check_training)
+    finished = staticmethod(finished_program)
 
 
 class ValidateEvaluation(ValidateConfig):

@@ -2,16 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from agents.controllers import CONTROLLERS
-from agents.pipeline import pick_device
+from agents.training_config import check_common
 from envs import SurveillanceConfig
 from envs.config import check_choice, check_range
 from envs.video import check_mp4
 from safety import SafetyConfig
-
-DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass
@@ -61,7 +58,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        check_common(self)
+        check_common(self.seed, self.device, self.threads)
         check_range("steps", self.steps, 0, 10**9)
         check_range("num_envs", self.num_envs, 1, 10**6)
         check_choice("resume", self.resume, ("auto", "never"))
@@ -87,11 +84,3 @@ class EvaluateConfig:
                     f"{name}={folder} is not the folder of a run: {folder}/.hydra/config.yaml does not exist."
                 )
         self.safety.gains(self.env)
-
-
-def check_common(config: Any) -> None:
-    """Check the fields that train.py and evaluate.py share."""
-    check_range("seed", config.seed, 0, 2**31)
-    check_choice("device", config.device, DEVICES)
-    check_range("threads", config.threads, 0, 1024)
-    pick_device(config.device)  # refuses cuda where there is none, before a folder exists

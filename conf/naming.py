@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,21 @@ from omegaconf import DictConfig, OmegaConf
 from agents.evaluation import rollout_steps
 
 # Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = ("seed", "device", "threads", "deterministic", "resume", "debug", "checkpoint", "log", "hydra", "folder")
-NOT_HASHED += ("video", "format", "samples")  # of evaluate.py's pictures
+NOT_HASHED = (
+    "seed",
+    "seeds",
+    "n_seeds",
+    "device",
+    "threads",
+    "deterministic",
+    "resume",
+    "debug",
+    "checkpoint",
+    "log",
+    "hydra",
+    "folder",
+    *("video", "format", "samples"),  # of evaluate.py's pictures
+)
 
 GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
@@ -27,15 +39,29 @@ def hashed_config(cfg: DictConfig) -> dict:
     return {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
 
 
-def compared_settings(cfg: DictConfig, choices: Mapping[str, str]) -> dict[str, Any]:
-    """What TensorBoard's HPARAMS tab compares runs by: seed, the file chosen in each group, and :func:`hashed_config`, nested.
+def run_name(cfg: DictConfig, seed: int) -> str:
+    """Name of the folder of a seed's run."""
+    return f"{config_hash(cfg)}_seed{seed}"
 
-    Args:
-        cfg: the composed configuration.
-        choices: Hydra's, by group.
-    """
-    groups = {f"group.{group}": choices[group] for group in GROUPS}
-    return {"seed": cfg.seed} | groups | hashed_config(cfg)
+
+def program_name(cfg: DictConfig) -> str:
+    """Name of Hydra's folder: the run's, or where several seeds are trained at once one of their own beside the runs'."""
+    seeds = seeds_of(cfg)
+    if len(seeds) == 1:
+        return run_name(cfg, seeds[0])
+    if seeds == list(range(seeds[0], seeds[0] + len(seeds))):
+        label = f"{seeds[0]}-{seeds[-1]}"
+    else:
+        label = "_".join(map(str, seeds))
+        label = label if len(label) < 40 else f"{len(seeds)}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+    return f"{config_hash(cfg)}_seeds{label}"
+
+
+def seeds_of(cfg: DictConfig) -> list[int]:
+    """Seeds of a composed, not yet checked configuration of train.py."""
+    if cfg.seeds:
+        return list(cfg.seeds)
+    return [cfg.seed + k for k in range(max(1, cfg.n_seeds))]
 
 
 def _plain(cfg: DictConfig, name: str) -> Any:

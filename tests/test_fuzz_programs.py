@@ -16,8 +16,8 @@ from agents.controllers import CONTROLLERS
 from conf.evaluate_schema import EvaluateConfig
 from conf.manual import defaults
 from conf.report_schema import ReportConfig
+from tests.synthetic_runs import write_run
 from tests.test_fuzz import ACCEPTED, STRANGE, check_refusal, one
-from tests.test_report import write_run
 
 COUNT = int(os.environ.get("FUZZ_CASES", "20"))
 TRAINING = ("experiment=smoke", "collector.total_frames=64", "eval.interval_frames=0", "log.figures=false")
