@@ -209,6 +209,10 @@ class SurveillanceEnv(EnvBase):
             for name, value in drawn.items():
                 self.state[name] = self.state[name].index_copy(0, index, value)
 
+    def compile(self, **_: object) -> None:
+        """TorchRL's compilation of a whole step, by its keyword ``compile``, is refused: it would trace TensorDicts."""
+        raise TypeError("SurveillanceEnv(compile_functions=True) compiles what is worth it; compile= is TorchRL's.")
+
     def _blank_state(self) -> TensorDict:
         zeros = {"dtype": self.config.torch_dtype, "device": self.device}
         b, n = self._robots

@@ -92,3 +92,10 @@ def test_kill_study(load, capsys):
     out = capsys.readouterr().out
     assert "0 differences" in out
     assert "| killed | processes |" in out
+
+
+def test_many_seeds_against_single_runs(load, capsys):
+    load("bench_seeds").main(["--seeds", "2", "--threads", "1", "--frames", "512", "experiment=smoke", "device=cpu"])
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith(("| 1", "| 2"))]
+    assert [row[0].strip() for row in rows] == ["1", "2"]
+    assert all(float(cell) > 0 for row in rows for cell in row)

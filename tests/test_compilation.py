@@ -14,6 +14,8 @@ from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.compilation import Compiled, compiled
 from safety import SafetyConfig, SafetyFilter
 
+pytestmark = pytest.mark.xdist_group("compilation")  # the compiler starts once
+
 
 def roll_out(world, steps=15, compile=False):
     env = SurveillanceEnv(world, 24, seed=3, compile_functions=compile)
@@ -70,6 +72,11 @@ def test_without_a_compiler_a_warning_and_the_same_results(world, monkeypatch):
 def test_a_compiled_function_survives_a_copy():
     function = pickle.loads(pickle.dumps(compiled(torch.sin, enabled=True)))
     torch.testing.assert_close(copy.deepcopy(function)(torch.ones(3)), torch.ones(3).sin())
+
+
+def test_torchrls_own_compilation_is_refused(world):
+    with pytest.raises(TypeError, match="compile_functions=True"):
+        SurveillanceEnv(world, 2, compile=True)
 
 
 def test_off_means_untouched():
