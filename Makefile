@@ -38,13 +38,16 @@ bench: venv
 # was stopped, on another machine too: runs of ARCHIVE count as done (ARCHIVE= : none), and $(FOLDER)/report/runs.tar.xz is the next one.
 ENVS ?= default,five_robots,random_density,moving_density
 SEEDS ?= range(10)
+# N_SEEDS=10: seeds 0..9 of a method as one program instead of one after the other, the same runs (always so on a GPU).
+N_SEEDS ?= $(if $(findstring cuda,$(DEVICE)),10)
 CONTROLLERS ?= coverage_cbf,lloyd,charge_when_low,random
 FOLDER ?= runs/benchmark
 ARCHIVE ?= docs/benchmark/runs.tar.xz
-SET = env=$(ENVS) 'seed=$(SEEDS)' num_envs=256 pictures=false resume=auto folder=$(FOLDER)/controllers $(DEVICE)
+ALL_SEEDS = $(if $(N_SEEDS),range($(N_SEEDS)),$(SEEDS))
+SET = env=$(ENVS) 'seed=$(ALL_SEEDS)' num_envs=256 pictures=false resume=auto folder=$(FOLDER)/controllers $(DEVICE)
 benchmark: venv
 	$(if $(wildcard $(ARCHIVE)),$(BIN)/python report.py sweep=$(FOLDER) unpack=$(ARCHIVE))
-	$(BIN)/python train.py -m experiment=benchmark env=$(ENVS) 'seed=$(SEEDS)' $(if $(METHODS),method=$(METHODS)) hydra.sweep.dir=$(FOLDER) $(DEVICE) $(ARGS)
+	$(BIN)/python train.py -m experiment=benchmark env=$(ENVS) $(if $(N_SEEDS),seed=0 n_seeds=$(N_SEEDS),'seed=$(SEEDS)') $(if $(METHODS),method=$(METHODS)) hydra.sweep.dir=$(FOLDER) $(DEVICE) $(ARGS)
 	$(BIN)/python evaluate.py -m controller=$(CONTROLLERS) $(SET)
 	$(BIN)/python evaluate.py -m controller=coverage_cbf_literal safety=paper env.on_violation=continue $(SET)
 	$(BIN)/python report.py sweep=$(FOLDER) incomplete=true pack=$(FOLDER)/report/runs.tar.xz

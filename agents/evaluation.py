@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from envs import SurveillanceEnv, keys
+from envs.coverage import powered_coverage_cost
 from envs.metrics import ChargeCounter, minimum_distance
 from envs.rendering import Trajectory
 from safety.statistics import FilterStatistics
@@ -52,7 +53,10 @@ def evaluate_policy(
     config = env.config
     td = env.reset()
     alive = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
-    total = {name: torch.zeros((), dtype=torch.float64, device=env.device) for name in ("cost", "reward", "worlds")}
+    total = {
+        name: torch.zeros((), dtype=torch.float64, device=env.device)
+        for name in ("cost", "powered", "reward", "worlds")
+    }
     violations = {kind: torch.zeros((), dtype=torch.int64, device=env.device) for kind in keys.VIOLATION_KINDS}
     energy_margin = distance_margin = torch.full((), math.inf, dtype=config.torch_dtype, device=env.device)
     charges = ChargeCounter(td[keys.ENERGY].squeeze(-1), config)
@@ -65,6 +69,7 @@ def evaluate_policy(
         energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
         total["worlds"] += alive.sum()
         total["cost"] += torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64)
+        total["powered"] += torch.where(alive, _powered_cost(env, following), 0).sum(dtype=torch.float64)
         total["reward"] += torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64)
         for kind in violations:
             violations[kind] += (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
@@ -88,6 +93,7 @@ def evaluate_policy(
             alive = alive & ~ended
     metrics = {
         "coverage_cost": _finite(total["cost"] / total["worlds"].clamp_min(1)),
+        "powered_coverage_cost": _finite(total["powered"] / total["worlds"].clamp_min(1)),
         "episode_reward": _finite(total["reward"] / env.batch_size.numel()),
         "violations": {kind: int(count) for kind, count in violations.items()},
         "charges_per_robot": float(charges.count.to(torch.float64).mean()),
@@ -97,6 +103,18 @@ def evaluate_policy(
         "terminated_worlds": int(restarts) if restart else int((~alive).sum()),
     }
     return metrics, statistics.summary(), None if history is None else history.trajectory()
+
+
+def _powered_cost(env: SurveillanceEnv, state: TensorDictBase) -> Tensor:
+    """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""
+    powered = (state[keys.ENERGY] >= env.config.energy_min).squeeze(-1)
+    if powered.all():
+        return state[keys.COVERAGE_COST]
+    density, position = env.density, state[keys.POSITION]
+    params = state[keys.DENSITY] if density.n_params else position.new_zeros(len(position), 0)
+    rest = (density.points, density.weights(params), density.cell_moment)
+    cost = powered_coverage_cost(position, powered, *rest, diameter=env.config.diameter).unsqueeze(-1)
+    return torch.where(powered.all(dim=-1, keepdim=True), state[keys.COVERAGE_COST], cost)
 
 
 def evaluation_scalars(metrics: dict) -> dict[str, float]:

@@ -61,6 +61,26 @@ def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment
     return weighted_sum(squared_distances(position, points).amin(dim=-2), weights) + cell_moment
 
 
+def powered_coverage_cost(
+    position: Tensor, powered: Tensor, points: Tensor, weights: Tensor, cell_moment: float, *, diameter: float
+) -> Tensor:
+    """:func:`coverage_cost` of the robots that still have power: an empty one watches nothing.
+
+    Args:
+        position: ``(*B, N, d)``, m.
+        powered: ``(*B, N)`` bool.
+        points: ``(Q, d)``, m.
+        weights: ``(Q,)`` or ``(*B, Q)``, summing to 1.
+        cell_moment: as :func:`coverage_cost`'s.
+        diameter: of the arena, m: where nobody has power, every point is this far from being watched.
+
+    Returns:
+        ``(*B,)``, m^2.
+    """
+    squared = squared_distances(position, points).masked_fill(~powered.unsqueeze(-1), diameter**2)
+    return weighted_sum(squared.amin(dim=-2), weights) + cell_moment
+
+
 def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
     """Sum over the quadrature points, ``(*B, Q)`` and ``(Q,)`` or ``(*B, Q)`` to ``(*B,)``.
 

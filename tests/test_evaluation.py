@@ -113,6 +113,35 @@ def test_metrics_are_those_of_the_stored_rollout(name, mode, on_violation, steps
         assert sum(counts.values()) == 0
 
 
+@pytest.mark.parametrize("density", ["uniform", "moving"])
+def test_a_drained_robot_watches_nothing(density):
+    world = SurveillanceConfig(on_violation="continue", density=density, resolution=6)
+    env, steps = SurveillanceEnv(world, B, seed=5), 100
+    points, moment, total, nobody = env.density.points, env.density.cell_moment, 0.0, 0
+    rows = store("gather", world, steps, mode="none")
+    for td in rows:
+        state = td["next"]
+        params = state[keys.DENSITY] if density == "moving" else torch.zeros(B, 0)
+        weights = env.density.weights(params).expand(B, -1)
+        for b in range(B):
+            awake = [
+                p
+                for p, e in zip(state[keys.POSITION][b], state[keys.ENERGY][b, :, 0], strict=True)
+                if e >= world.energy_min
+            ]
+            nobody += not awake
+            near = [
+                min([float((p - q).square().sum()) for p in awake], default=8.0) for q in points
+            ]  # 8: a square of 2 m
+            total += float(torch.tensor(near) @ weights[b]) + moment
+    metrics, _, _ = evaluate_policy(env, policy_of("gather", world, mode="none"), steps)
+    assert metrics["powered_coverage_cost"] == pytest.approx(total / (B * steps), rel=1e-4)
+    assert metrics["powered_coverage_cost"] > 1.2 * metrics["coverage_cost"]
+    assert nobody
+    safe, _, _ = evaluate_policy(env, policy_of("random", world), 20)
+    assert safe["powered_coverage_cost"] == safe["coverage_cost"]
+
+
 def test_statistics_count_living_worlds_only():
     world = SurveillanceConfig()
     steps, name, mode = 60, "random", "none"
