@@ -30,7 +30,7 @@ from agents.training_state import TrainingState
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
 from conf.naming import hashed_config
-from conf.run_folder import announce_certificate, finished_run, write_json
+from conf.run_folder import announce_certificate, finished_run, objective, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
 from envs import SurveillanceEnv, keys
@@ -43,13 +43,13 @@ logging.getLogger("torchrl").setLevel(logging.WARNING)
 @clear_errors(Config)
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 @one_clear_error
-def main(cfg: DictConfig) -> None:
-    """One run: its folder is Hydra's run folder."""
+def main(cfg: DictConfig) -> float | None:
+    """One run: its folder is Hydra's run folder. Returns the coverage cost, for tuning."""
     config: Config = to_config(cfg)
     folder = Path(HydraConfig.get().runtime.output_dir)
     if message := finished_run(folder, config.resume):  # a job of a multirun; single runs end before they get here
         tqdm.write(message)
-        return
+        return objective(folder)
 
     # ---- build: every random stream has its own seed; the global one draws the initial weights only
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
@@ -160,6 +160,7 @@ def main(cfg: DictConfig) -> None:
     write_json(folder / "summary.json", origin | recorder.summary() | speed | kept | metrics)
     board.close()
     tqdm.write(f"{folder}/summary.json\n{json.dumps(recorder.evaluation, indent=2)}")
+    return objective(folder)
 
 
 if __name__ == "__main__":

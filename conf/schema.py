@@ -1,6 +1,6 @@
 """Typed root configuration of train.py and evaluate.py, its checks, and the registration of all schemas with Hydra."""
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from agents.controllers import CONTROLLERS
 from agents.maddpg import check_loss
 from agents.pipeline import pick_device
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
-from conf.manual import explain, manual
+from conf.launching import register_resolvers
+from conf.manual import check_names, manual
 from conf.naming import config_hash, evaluation_folder, hashed_config
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
@@ -287,6 +288,7 @@ def register() -> None:
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="report_schema", node=ReportConfig)
     OmegaConf.register_new_resolver("config_hash", lambda *, _root_: config_hash(_root_), replace=True)
+    register_resolvers()
     schemas = {"train": Config, "evaluate": EvaluateConfig, "report": ReportConfig}
     OmegaConf.register_new_resolver("manual", lambda program: manual(schemas[program]), replace=True)
     OmegaConf.register_new_resolver("evaluation_folder", lambda *, _root_: evaluation_folder(_root_), replace=True)
@@ -301,22 +303,10 @@ def to_config(cfg: DictConfig) -> Any:
     own = cfg.copy()
     with open_dict(own):
         own.pop("hydra", None)
-    _check_names(own)
+    check_names(own)
     if "run" in own and own.run is not None:  # world and filter are the run's: run_config applies the overrides to them
         own.env, own.safety = OmegaConf.structured(SurveillanceConfig), OmegaConf.structured(SafetyConfig)
     return OmegaConf.to_object(own)
-
-
-def _check_names(cfg: DictConfig, prefix: str = "") -> None:
-    """Refuse options that were added (+name=) or deleted (~name): the first would do nothing, the second is not meant."""
-    known = {entry.name for entry in fields(OmegaConf.get_type(cfg))}
-    for key in sorted({str(key) for key in cfg} ^ known):
-        if key in known:
-            raise ValueError(f"~{prefix}{key}: options cannot be deleted; leave it out for its default.")
-        raise ValueError(explain(Config, f"{prefix}{key}") + " python <program> --help lists all options.")
-    for key in cfg:
-        if OmegaConf.is_dict(value := cfg._get_node(key)) and is_dataclass(OmegaConf.get_type(value)):
-            _check_names(value, f"{prefix}{key}.")  # pyright: ignore[reportArgumentType]
 
 
 def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
