@@ -24,6 +24,7 @@ from conf.command_line import fail, wants_traceback
 from conf.job_log import FAILED, LOG, JobLog, keep_failure
 from conf.run_folder import BusyFolderError, finished_run, foreign_run, only_writer
 from conf.schema import check_evaluation, check_training, to_config
+from conf.tuning import go_on
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 EXPECTED_IN_RUN = (
@@ -64,6 +65,10 @@ class ValidateConfig(Callback):
         if message:  # before Hydra rewrites .hydra/
             sys.stderr.write(message + "\n")
             sys.exit(0)
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Before the sweeper exists."""
+        go_on(config.hydra.sweeper)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """A run beside others writes to a log of its own."""

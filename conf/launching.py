@@ -9,6 +9,8 @@ import os
 import re
 import shutil
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -44,10 +46,16 @@ def cores() -> int:
 
 
 def register_resolvers() -> None:
-    """``${cores:<threads>}``: cores of a run with so many threads, 0 = all of them; ``${runs_at_once:<threads>}``."""
+    """``${cores:<threads>}``: cores of a run with so many threads, 0 = all of them; ``${runs_at_once:<threads>}``.
+
+    ``${cores_of_cluster:<address>}``: those of a Ray cluster that is started here; null for one that runs already.
+    """
     OmegaConf.register_new_resolver("cores", lambda threads: int(threads) or cores(), replace=True)
     OmegaConf.register_new_resolver(
         "runs_at_once", lambda threads: max(1, cores() // (int(threads) or cores())), replace=True
+    )
+    OmegaConf.register_new_resolver(
+        "cores_of_cluster", lambda address: cores() if address in (None, "local") else None, replace=True
     )
 
 
@@ -80,16 +88,22 @@ def check_launcher(name: str, launcher: DictConfig) -> None:
             )
     if target.endswith("RayLauncher"):
         address = OmegaConf.select(launcher, "ray.init.address") or ""
-        if match := re.fullmatch(r"(?:ray://)?(\[[^]]+\]|[^:/]+):(\d+)", str(address)):
-            _reach(name, match.group(1).strip("[]"), int(match.group(2)))
+        if match := re.fullmatch(r"(ray://)?(\[[^]]+\]|[^:/]+):(\d+)", str(address)):
+            _reach(name, match.group(2).strip("[]"), int(match.group(3)), client=bool(match.group(1)))
 
 
-def _reach(name: str, host: str, port: int) -> None:
+def _reach(name: str, host: str, port: int, client: bool) -> None:
+    """Ray itself would try for minutes."""
     try:
         socket.create_connection((host, port), timeout=REACH_SECONDS).close()
-    except (OSError, OverflowError) as error:
+        if not client:  # somebody answers: is it Ray?
+            command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", f"{host}:{port}"]
+            # whatever it finds, it finds at once: only what is no Ray keeps it waiting
+            subprocess.run(command, timeout=4 * REACH_SECONDS, capture_output=True, check=False)
+    except (OSError, OverflowError, subprocess.TimeoutExpired) as error:
+        why = "no Ray there" if isinstance(error, subprocess.TimeoutExpired) else error
         raise SweepError(
-            f"hydra/launcher={name}: the Ray cluster at {host}:{port} does not answer ({error}). Start its head node (ray start "
+            f"hydra/launcher={name}: the Ray cluster at {host}:{port} does not answer ({why}). Start its head node (ray start "
             "--head), correct hydra.launcher.ray.init.address, or leave it out for a cluster on this machine. Nothing was started."
         ) from error
 
