@@ -53,7 +53,7 @@ class StopSignals:
         if self._signum is None and time.monotonic() - self._looked > 1.0:
             self._looked = time.monotonic()
             if sweep_stops():
-                self._signum = signal.SIGTERM
+                self._signum, self._handlers = signal.SIGTERM, {}
         return self._signum
 
     def __enter__(self) -> "StopSignals":

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from agents.interruption import STOP_FILE
+
 LOG = "run.log"
 """In the run's folder: all output of a run beside others; of any failed run of a sweep, the traceback."""
 FAILED = "failed.json"
@@ -42,7 +44,12 @@ class JobLog:
         with path.open("ab") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the sweep's, which asks the runs to stop
+        own = os.environ.get(STOP_FILE, "").endswith(
+            f"_{os.getpid()}"
+        )  # joblib with one run at once takes no other process
+        # Ctrl-C is the sweep's, which asks the runs to stop
+        if not own:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def close(self) -> None:
         """Back to where the output went before."""

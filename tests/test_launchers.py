@@ -1,11 +1,14 @@
 """Sweeps on every launcher: what is refused before they start, what they leave alone, what they say of runs that fail."""
 
+import contextlib
 import json
 import os
 import pickle
 import signal
 import socket
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -21,6 +24,7 @@ from conf import launching
 from conf.job_log import FailedRunError
 from conf.run_folder import BusyFolderError, only_writer
 from conf.schema import register
+from tests import fake_slurm
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -81,6 +85,106 @@ def test_submitit_on_this_machine(program, tmp_path):
     pytest.importorskip("submitit", reason="needs the extra slurm")
     code, output = program(train.main, "-m", *prepare(tmp_path / "sweep"), "hydra/launcher=submitit_local")
     check_sweep(tmp_path / "sweep", code, output)
+
+
+def preempt(folder, frames):
+    """Send SIGUSR2, as Slurm does before a job's time is up, to the process that trains in ``folder``."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        time.sleep(0.2)
+        log = folder / "run.log"
+        lock = folder / ".hydra" / "lock"
+        if not log.is_file() or not lock.is_file() or "frame/s" not in log.read_text():
+            continue
+        for process in Path("/proc").glob("[0-9]*/fd/*"):
+            with contextlib.suppress(OSError):
+                if process.resolve() == lock.resolve():
+                    os.kill(int(process.parts[2]), signal.SIGUSR2)
+                    return
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="finds the job's process in /proc")
+@pytest.mark.parametrize("cluster", ["slurm", "submitit_local"])
+def test_a_job_whose_time_is_up_is_queued_again_and_goes_on(program, tmp_path, monkeypatch, cluster):
+    pytest.importorskip("submitit", reason="needs the extra slurm")
+    if cluster == "slurm":
+        fake_slurm.install(tmp_path / "slurm")
+        monkeypatch.setenv("PATH", str(tmp_path / "slurm"), prepend=os.pathsep)
+    frames = 20_000
+    runs = (*TINY, f"collector.total_frames={frames}", "collector.num_envs=50", "eval.interval_frames=0", "seed=0,1")
+    sender = threading.Thread(target=preempt, args=(tmp_path / "sweep" / "0", frames))
+    sender.start()
+    code, output = program(
+        train.main, "-m", *runs, f"hydra/launcher={cluster}", "hydra.sweep.dir=sweep", "hydra.sweep.subdir='${seed}'"
+    )
+    sender.join()
+    assert code == 0, output
+    log = (tmp_path / "sweep" / "0" / "run.log").read_text()
+    assert "going on from" in log, log
+    for seed in ("0", "1"):
+        assert json.loads((tmp_path / "sweep" / seed / "summary.json").read_text())["frames"] == frames
+    assert "going on from" not in (tmp_path / "sweep" / "1" / "run.log").read_text()
+    assert "Requeued job" in log
+    if cluster == "slurm":
+        script = (tmp_path / "slurm" / "script").read_text()
+        assert "#SBATCH --array=0-1" in script
+        assert "#SBATCH --requeue" in script
+        assert (tmp_path / "slurm" / "requeued_4242_0").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="finds the run's process in /proc")
+def test_a_process_that_is_killed_takes_no_other_run_with_it(program, tmp_path, monkeypatch):
+    monkeypatch.setattr(signal, "SIGUSR2", signal.SIGKILL)  # what preempt() sends
+    runs = (*TINY, "collector.total_frames=10000", "collector.num_envs=50", "seed=0,1,2")
+    sender = threading.Thread(target=preempt, args=(tmp_path / "sweep" / "0", 0))
+    sender.start()
+    code, output = program(
+        train.main, "-m", *runs, "hydra/launcher=local", "hydra.sweep.dir=sweep", "hydra.sweep.subdir='${seed}'"
+    )
+    sender.join()
+    assert code == 0, output
+    assert "a run's process died" in output
+    for seed in ("0", "1", "2"):
+        assert json.loads((tmp_path / "sweep" / seed / "summary.json").read_text())["frames"] == 10_000
+
+
+@pytest.mark.slow
+def test_a_study_goes_on(program, tmp_path):
+    optuna = pytest.importorskip("optuna", reason="needs the extra optuna")
+    tiny = (
+        "experiment=tune",
+        "train=smoke",
+        "collector.total_frames=256",
+        "eval.interval_frames=0",
+        "hydra.sweeper.params={agent.actor_lr:'choice(1e-3,5)',agent.tau:'interval(0.001,0.05)'}",
+    )
+    code, output = program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=4")
+    assert code == 1, output  # learning rates of 5 are refused; the study went on
+    assert "agent.actor_lr=5" in output.split("of the sweep's runs failed")[1]
+    storage = f"sqlite:///{tmp_path}/runs/tune/study.db"
+    (summary,) = optuna.get_all_study_summaries(storage)
+    study = optuna.load_study(study_name=summary.study_name, storage=storage)
+    assert len(study.trials) == 4
+    values = [trial.value for trial in study.trials if trial.state.name == "COMPLETE"]
+    assert 0 < len(values) < 4
+    costs = [json.loads(path.read_text())["eval"]["coverage_cost"] for path in tmp_path.rglob("summary.json")]
+    assert sorted(costs) == pytest.approx(sorted(values))
+
+    # a trial that was killed is made again, then the study ends where it would have
+    killed = study.ask({"agent.actor_lr": optuna.distributions.CategoricalDistribution(["1e-3", "5"])})
+    assert killed.number == 4
+    _, output = program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=6")
+    states = [trial.state.name for trial in study.trials]
+    assert states[4] == "FAIL"
+    assert study.trials[5].params["agent.actor_lr"] == killed.params["agent.actor_lr"]
+    assert len(states) == 7
+    assert "RUNNING" not in states
+    program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=6")
+    assert len(study.trials) == 7
+    program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=1", "agent.gamma=0.9")  # other settings, another study
+    assert len(optuna.get_all_study_summaries(storage)) == 2
 
 
 @pytest.mark.slow
