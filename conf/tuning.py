@@ -1,5 +1,6 @@
 """Studies of Optuna that go on: what their storage holds, and trials that were killed."""
 
+import warnings
 from pathlib import Path
 
 from omegaconf import DictConfig, read_write
@@ -30,10 +31,12 @@ def go_on(sweeper: DictConfig) -> None:
     except KeyError:  # the file holds other studies
         return
     trials = study.trials
-    for trial in trials:
-        if not trial.state.is_finished() and trial.params:
-            study.tell(trial.number, state=type(trial.state).FAIL)
-            study.enqueue_trial(trial.params)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # enqueue_trial is one in Optuna 2
+        for trial in trials:
+            if not trial.state.is_finished() and trial.params:
+                study.tell(trial.number, state=type(trial.state).FAIL)
+                study.enqueue_trial(trial.params)
     # a trial that is made again counts once
     ended = {repr(sorted(trial.params.items())) for trial in trials if trial.state.is_finished()}
     with read_write(sweeper):

@@ -165,7 +165,11 @@ def test_a_study_goes_on(program, tmp_path):
     assert "agent.actor_lr=5" in output.split("of the sweep's runs failed")[1]
     storage = f"sqlite:///{tmp_path}/runs/tune/study.db"
     (summary,) = optuna.get_all_study_summaries(storage)
-    study = optuna.load_study(study_name=summary.study_name, storage=storage)
+
+    def load():
+        return optuna.load_study(study_name=summary.study_name, storage=storage)
+
+    study = load()
     assert len(study.trials) == 4
     values = [trial.value for trial in study.trials if trial.state.name == "COMPLETE"]
     assert 0 < len(values) < 4
@@ -173,16 +177,16 @@ def test_a_study_goes_on(program, tmp_path):
     assert sorted(costs) == pytest.approx(sorted(values))
 
     # a trial that was killed is made again, then the study ends where it would have
-    killed = study.ask({"agent.actor_lr": optuna.distributions.CategoricalDistribution(["1e-3", "5"])})
+    killed = study.ask({"agent.actor_lr": optuna.distributions.CategoricalDistribution([0.001, 5])})
     assert killed.number == 4
     _, output = program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=6")
-    states = [trial.state.name for trial in study.trials]
+    states = [trial.state.name for trial in load().trials]
     assert states[4] == "FAIL"
-    assert study.trials[5].params["agent.actor_lr"] == killed.params["agent.actor_lr"]
+    assert load().trials[5].params["agent.actor_lr"] == killed.params["agent.actor_lr"]
     assert len(states) == 7
     assert "RUNNING" not in states
     program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=6")
-    assert len(study.trials) == 7
+    assert len(load().trials) == 7
     program(train.main, "-m", *tiny, "hydra.sweeper.n_trials=1", "agent.gamma=0.9")  # other settings, another study
     assert len(optuna.get_all_study_summaries(storage)) == 2
 
