@@ -342,6 +342,16 @@ def test_slurm_asks_for_what_was_given(monkeypatch, tmp_path):
         assert f"#SBATCH --{line}" in lines
 
 
+def test_the_extras_have_the_versions_of_the_rest():
+    def versions(name):
+        lines = (ROOT / name).read_text().splitlines()
+        return dict(line.split("==") for line in lines if not line.startswith("#"))
+
+    usual, extras = versions("constraints.txt"), versions("constraints-extras.txt")
+    assert set(usual) < set(extras)
+    assert {name for name in usual if usual[name] != extras[name]} == {"cloudpickle", "joblib", "python-dateutil"}
+
+
 def test_one_process_per_folder(tmp_path):
     (tmp_path / ".hydra").mkdir()
     with (
