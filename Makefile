@@ -20,7 +20,7 @@ train: venv
 	$(BIN)/python train.py $(ARGS)
 
 test: venv
-	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 $(ARGS)
+	OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 
 lint: venv
 	$(BIN)/ruff check .
@@ -35,14 +35,16 @@ bench: venv
 	@for name in qp filter env_step update; do $(BIN)/python tests/benchmarks/bench_$$name.py --seconds 5 $(ARGS) || exit 1; done
 
 # The whole table, or a part: make benchmark ENVS=default SEEDS='range(3)' METHODS=certified,ddpg DEVICE=device=cpu. Goes on where it
-# was stopped.
+# was stopped, on another machine too: runs of ARCHIVE count as done (ARCHIVE= : none), and $(FOLDER)/report/runs.tar.xz is the next one.
 ENVS ?= default,five_robots,random_density,moving_density
 SEEDS ?= range(10)
 CONTROLLERS ?= coverage_cbf,lloyd,charge_when_low,random
 FOLDER ?= runs/benchmark
+ARCHIVE ?= docs/benchmark/runs.tar.xz
 SET = env=$(ENVS) 'seed=$(SEEDS)' num_envs=256 pictures=false resume=auto folder=$(FOLDER)/controllers $(DEVICE)
 benchmark: venv
+	$(if $(wildcard $(ARCHIVE)),$(BIN)/python report.py sweep=$(FOLDER) unpack=$(ARCHIVE))
 	$(BIN)/python train.py -m experiment=benchmark env=$(ENVS) 'seed=$(SEEDS)' $(if $(METHODS),method=$(METHODS)) hydra.sweep.dir=$(FOLDER) $(DEVICE) $(ARGS)
 	$(BIN)/python evaluate.py -m controller=$(CONTROLLERS) $(SET)
 	$(BIN)/python evaluate.py -m controller=coverage_cbf_literal safety=paper env.on_violation=continue $(SET)
-	$(BIN)/python report.py sweep=$(FOLDER)
+	$(BIN)/python report.py sweep=$(FOLDER) incomplete=true pack=$(FOLDER)/report/runs.tar.xz

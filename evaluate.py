@@ -2,7 +2,7 @@
 
 ``python evaluate.py run=<folder>`` writes ``<folder>/eval/<world>_<steps>_<seed>/``; ``python evaluate.py
 controller=<name> env=… safety=…`` writes a folder under ``runs/controllers/``. Both hold eval.json, the pictures of the
-paper's Figs 5-7, a GIF, the paths and the battery plot of the first world.
+paper's Figs 5-7, the paths, the battery plot and a video (GIF, MP4) of the first world.
 """
 
 import functools
@@ -27,12 +27,14 @@ from agents.networks import make_actor
 from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
+from conf.evaluate_schema import EvaluateConfig
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
-from conf.schema import Config, EvaluateConfig, register, run_config, to_config
+from conf.schema import Config, register, run_config, to_config
 from conf.versions import git_hash
 from envs import SurveillanceConfig, SurveillanceEnv
 from envs.path_plot import save_path_plot
-from envs.rendering import save_battery_plot, save_gif, save_snapshots
+from envs.rendering import Trajectory, save_battery_plot, save_snapshots
+from envs.video import save_gif, save_mp4
 from safety import SafetyConfig, SafetyFilter
 
 register()
@@ -52,7 +54,7 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile=config.compile)
+    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile_functions=config.compile)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)
@@ -79,7 +81,7 @@ def main(cfg: DictConfig) -> None:
     check = functools.partial(check_violations, world=world, safety=safety, folder=folder)
     start = time.perf_counter()
     metrics, statistics, trajectory = evaluate_policy(
-        env, policy, steps, record=config.pictures, restart=config.restart, check=check
+        env, policy, steps, record=config.pictures, samples=config.samples, restart=config.restart, check=check
     )
     content = {
         **metrics,
@@ -94,11 +96,20 @@ def main(cfg: DictConfig) -> None:
     }
     write_json(folder / "eval.json", content)
     if trajectory is not None:
-        save_snapshots(trajectory, folder)
-        save_battery_plot(trajectory, folder / "battery.png")
-        save_path_plot(trajectory, folder / "paths.png")
-        save_gif(trajectory, folder / "world.gif", max_frames=60)
+        save_pictures(trajectory, folder, config)
     tqdm.write(f"{folder}/eval.json\n{json.dumps(metrics | {'filter': statistics}, indent=2)}")
+
+
+def save_pictures(trajectory: Trajectory, folder: Path, config: EvaluateConfig) -> None:
+    """Figures and videos of one world."""
+    suffix = config.format
+    save_snapshots(trajectory, folder, suffix=suffix)
+    save_battery_plot(trajectory, folder / f"battery.{suffix}")
+    save_path_plot(trajectory, folder / f"paths.{suffix}")
+    if config.video in ("gif", "both"):
+        save_gif(trajectory, folder / "world.gif", max_frames=60)
+    if config.video in ("mp4", "both"):
+        save_mp4(trajectory, folder / "world.mp4")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Compare the runs of a sweep: tables and learning curves with confidence intervals over the seeds.
 
-``python report.py sweep=<folder>`` writes ``<folder>/report/``; ``python report.py --help`` says what and from what.
+``python report.py sweep=<folder>`` writes ``<folder>/report/``; ``python report.py --help`` says what and from what, and how
+a sweep outlives its machine.
 """
 
 import logging
@@ -11,9 +12,10 @@ import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from agents.report_archive import pack_runs, unpack_runs
 from agents.report_figures import save_figures
-from agents.report_runs import Run, check_runs, find_runs, read_curves
-from agents.report_statistics import Bootstrap, Groups, compute_curves, compute_rows
+from agents.report_runs import check_runs, find_runs, read_events
+from agents.report_statistics import LOGGED, Bootstrap, Groups, compute_curves, compute_rows
 from agents.report_tables import Report, find_method, write_curves, write_rows, write_runs
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
@@ -31,22 +33,22 @@ FILES = ("report.md", "table.csv", "runs.csv", "curves.csv", "curves.png", "curv
 @hydra.main(version_base="1.3", config_path="conf", config_name="report")
 @one_clear_error
 def main(cfg: DictConfig) -> None:
-    """One report."""
+    """One report, or the unpacking of an archive of runs."""
     config: ReportConfig = to_config(cfg)
     sweep = Path(config.sweep or "").expanduser()
+    if config.unpack is not None:
+        tqdm.write(unpack_runs(Path(config.unpack).expanduser(), sweep))
+        return
     runs, warnings = check_runs(find_runs(sweep, config_hash), incomplete=config.incomplete)
     groups, bootstrap = Groups(runs), Bootstrap(config.resamples, config.confidence, config.seed)
     reference = find_method(groups, config.reference, "reference")
     against = find_method(groups, config.against, "against")
     rows = compute_rows(groups, bootstrap, reference)
-    # event files take about half a second each
-    with tqdm(total=sum(run.learned for run in runs), unit="run", disable=None) as bar:
-
-        def read(run: Run) -> dict:
-            bar.update()
-            return read_curves(run)
-
-        curves, unlogged = compute_curves(groups, bootstrap, read)
+    learned = [run for run in runs if run.learned]
+    events = {  # files with pictures take about half a second each
+        run.name: read_events(run.folder, LOGGED.values()) for run in tqdm(learned, unit="run", disable=None)
+    }
+    curves, unlogged = compute_curves(groups, bootstrap, lambda run: events[run.name].curves())
     warnings += unlogged
     report = Report(groups, rows, reference, against)
 
@@ -67,6 +69,8 @@ def main(cfg: DictConfig) -> None:
             else:
                 (target / name).unlink(missing_ok=True)
     tqdm.write("".join(f"warning: {line}\n" for line in warnings) + str(target / "report.md"))
+    if config.pack is not None:
+        tqdm.write(pack_runs(runs, events, Path(config.pack).expanduser()))
 
 
 if __name__ == "__main__":

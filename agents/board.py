@@ -10,13 +10,10 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from envs import keys
 from envs.animation import Painter, write_gif
 from envs.path_plot import path_figure
 from envs.rendering import Trajectory
 
-FINAL = ("eval/coverage_cost", "eval/charges_per_robot", "filter/intervention_rate", "train/return")
-"""Scalars that the HPARAMS tab compares runs by, beside the violations in training."""
 GIF_FRAMES = 50
 
 
@@ -86,10 +83,13 @@ class Board:
         self.writer._get_file_writer().add_summary(summary, frames)
 
     def _hyperparameters(self, config: Mapping[str, Any]) -> None:
-        """In the run's own file: ``add_hparams`` would make a run of its own, without curves."""
-        metrics = dict.fromkeys([*FINAL, *(f"train/violations_{kind}" for kind in keys.VIOLATION_KINDS)], 0.0)
-        for summary in hparams(plain(config), metrics):
-            self.writer._get_file_writer().add_summary(summary)
+        """In the run's own file: ``add_hparams`` would make a run of its own, without curves.
+
+        Without the description of an experiment, which would fix one run's columns for all: so TensorBoard puts the settings
+        that differ between the runs first, and takes every scalar for a metric.
+        """
+        _, start, _ = hparams(plain(config), {})
+        self.writer._get_file_writer().add_summary(start)
 
 
 def plain(config: Mapping[str, Any], prefix: str = "") -> dict[str, bool | str | float]:

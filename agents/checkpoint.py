@@ -69,6 +69,8 @@ def _remove(path: Path) -> None:
 def set_aside(folder: Path, found: list[Path] | None = None) -> Path | None:
     """Move what an earlier run wrote into ``folder`` to ``replaced_<k>`` inside it, so that nothing is mixed or lost.
 
+    Event files lose the word that TensorBoard knows them by: replaced runs would stand among the others.
+
     Args:
         folder: the run's folder.
         found: what to move; everything that a run writes if not given.
@@ -91,8 +93,9 @@ def set_aside(folder: Path, found: list[Path] | None = None) -> Path | None:
         return None
     target = folder / f"replaced_{1 + len(list(folder.glob('replaced_*')))}"
     for path in found:
-        (target / path.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
-        path.rename(target / path.relative_to(folder))
+        place = target / path.relative_to(folder)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(place.with_name(place.name.replace("tfevents", "replaced")))
     return target
 
 
@@ -138,6 +141,11 @@ def _other_of(path: Path) -> str:
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a ``checkpoints`` folder, oldest first (they are named by frames, zero-padded)."""
     return sorted(folder.glob("frames_*.pt"))
+
+
+def frames_of(path: Path) -> int:
+    """World-steps that the run had collected, by a checkpoint's name."""
+    return int(path.stem.removeprefix("frames_"))
 
 
 def latest_checkpoint(run: Path) -> Path:

@@ -15,7 +15,7 @@ from envs.metrics import ChargeCounter, minimum_distance
 from envs.rendering import Trajectory
 from safety.statistics import FilterStatistics
 
-RECORD_LIMIT = 2000  # samples of the recorded world; longer rollouts keep every n-th
+RECORD_LIMIT = 2000  # samples of the recorded world by default; longer rollouts keep every n-th
 
 
 def rollout_steps(horizon: int) -> int:
@@ -30,6 +30,7 @@ def evaluate_policy(
     steps: int,
     *,
     record: bool = False,
+    samples: int = RECORD_LIMIT,
     restart: bool = False,
     check: Callable[[TensorDictBase, Tensor], None] | None = None,
 ) -> tuple[dict, dict, Trajectory | None]:
@@ -40,6 +41,7 @@ def evaluate_policy(
         policy: writes ("agents", "action") and the filter's diagnostics.
         steps: length of the rollout.
         record: keep the history of the first world.
+        samples: and this many samples of it at most, evenly spread; about 1 kB each (more with a moving density).
         restart: draw a terminated world anew and go on counting in it.
         check: called with every transition and the worlds that count, ``(*B, 1)`` bool, such as
             :func:`agents.incident.check_violations`.
@@ -56,7 +58,7 @@ def evaluate_policy(
     charges = ChargeCounter(td[keys.ENERGY].squeeze(-1), config)
     statistics = FilterStatistics(config.max_speed)
     restarts = torch.zeros((), dtype=torch.int64, device=env.device)
-    history = _History(env, every=math.ceil(steps / RECORD_LIMIT)) if record else None
+    history = _History(env, every=math.ceil(steps / samples)) if record else None
     for k in range(steps):
         td = env.step(policy(td))
         following = td["next"]

@@ -177,14 +177,26 @@ def make_optimizers(loss: MADDPGLoss, agent: AgentConfig) -> dict[str, torch.opt
 
 
 def reduce_robots(loss: Tensor, agent: AgentConfig) -> Tensor:
-    """Mean over the minibatch, sum over the robots, ``(batch, N) -> ()``.
+    """Mean over the minibatch, sum over the robots, ``(*B, batch, N) -> (*B,)``.
 
     With ``minibatch=per_agent`` the batch is N consecutive minibatches and robot i counts in the i-th only.
     """
     if agent.minibatch == "per_agent":
-        n = loss.shape[-1]
-        return loss.unflatten(0, (n, -1)).diagonal(dim1=0, dim2=-1).mean(dim=0).sum()
-    return loss.mean(dim=0).sum()
+        loss = loss.unflatten(-2, (loss.shape[-1], -1)).diagonal(dim1=-3, dim2=-1)
+    return loss.mean(dim=-2).sum(-1)
+
+
+def clip_gradients(parameters: list[Tensor], limit: float, n_learners: int) -> Tensor:
+    """Cut every learner's gradient to a norm of ``limit``; returns the norms before that, ``()``, or ``(K,)`` of several."""
+    if n_learners == 1:
+        return nn.utils.clip_grad_norm_(parameters, limit)
+    norms = []
+    gradients = [weight.grad.unflatten(0, (n_learners, -1)) for weight in parameters if weight.grad is not None]
+    for own in zip(*gradients, strict=True):  # one by one: its bits are those of a learner alone
+        norms.append(nn.utils.get_total_norm(own))
+        for gradient in own if limit != float("inf") else ():
+            gradient.mul_((limit / (norms[-1] + 1e-6)).clamp(max=1.0))
+    return torch.stack(norms)
 
 
 def update_step(
@@ -197,28 +209,29 @@ def update_step(
     """One gradient step of all critics and all actors, then the soft update of the targets.
 
     Args:
-        batch: ``(batch,)`` transitions (``N x batch`` of them with ``minibatch=per_agent``).
+        batch: ``(batch,)`` transitions (``N x batch`` of them with ``minibatch=per_agent``); ``(K, batch)`` for the
+            networks of K learners (:mod:`agents.learners`), each updated by its own row.
         loss_module: the losses.
         optimizers: from :func:`make_optimizers`.
         target_updater: soft update of the target networks.
         agent: reduction and clipping.
 
     Returns:
-        Detached scalars: losses, mean Q and target, gradient norms.
+        Detached losses, mean Q and target, gradient norms: ``()`` each, or ``(K,)``.
     """
     losses = loss_module(batch)
     metrics: dict[str, Tensor] = {
-        "q_value": losses["pred_value"].detach().mean(),
-        "target": losses["target_value"].detach().mean(),
+        "q_value": losses["pred_value"].detach().mean((-2, -1)),
+        "target": losses["target_value"].detach().mean((-2, -1)),
     }
+    n_learners = batch.shape[:-1].numel()
     for name, optimizer in optimizers.items():  # only loss_* keys: pred_value carries a graph too
         loss = reduce_robots(losses[name], agent)
         optimizer.zero_grad()
-        loss.backward()
-        parameters = optimizer.param_groups[0]["params"]
+        loss.sum().backward()
         limit = agent.max_grad_norm or float("inf")
-        metrics[f"grad_norm_{name.removeprefix('loss_')}"] = nn.utils.clip_grad_norm_(parameters, limit)
+        norm = clip_gradients(optimizer.param_groups[0]["params"], limit, n_learners)
         optimizer.step()
-        metrics[name.removeprefix("loss_")] = loss.detach()
+        metrics |= {f"grad_norm_{name.removeprefix('loss_')}": norm, name.removeprefix("loss_"): loss.detach()}
     target_updater.step()
     return metrics

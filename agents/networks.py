@@ -16,7 +16,9 @@ JOINT_ACTION = ("agents", "joint_action")
 STATE_ACTION_VALUE = ("agents", "state_action_value")
 
 
-Layers = list[tuple[Tensor, Tensor]]  # weight and bias, layer by layer; a leading dimension N where nothing is shared
+Layers = list[
+    tuple[Tensor, Tensor]
+]  # weight and bias, layer by layer; a leading dimension (K, N, K N) for several networks
 
 
 class BatchedMLP(MultiAgentMLP):
@@ -30,29 +32,58 @@ class BatchedMLP(MultiAgentMLP):
         n_agents: number of robots.
         cells: hidden units (ReLU), layer by layer.
         share_params: one network for all robots.
+        n_learners: learners K, each with networks of its own.
     """
 
-    def __init__(self, n_in: int, n_out: int, n_agents: int, cells: list[int], *, share_params: bool) -> None:
+    def __init__(
+        self, n_in: int, n_out: int, n_agents: int, cells: list[int], *, share_params: bool, n_learners: int = 1
+    ) -> None:
         super().__init__(
-            *(n_in, n_out, n_agents),
+            *(n_in, n_out, n_learners * (1 if share_params else n_agents) if n_learners > 1 else n_agents),
             centralized=False,  # a robot's row already holds all that it sees
-            share_params=share_params,
+            share_params=share_params and n_learners == 1,
             num_cells=cells,
             activation_class=nn.ReLU,
         )
+        self.n_learners, self.shared = n_learners, share_params
 
     def forward(self, x: Tensor, layers: Layers | None = None) -> Tensor:
-        """``(*B, N, n_in) -> (*B, N, n_out)``; ``layers`` take the place of the own ones."""
+        """``(*B, N, n_in) -> (*B, N, n_out)``, several learners' batches one after the other in the first dimension of B.
+
+        ``layers`` take the place of the own ones. Each learner's results are those of its networks alone.
+        """
         layers = layers_of(self.params) if layers is None else layers
-        if self.share_params:
+        if self.n_learners == 1:
+            return self._alone(x, layers)
+        shape, k = x.shape, self.n_learners
+        x = x.reshape(k, -1, *shape[-2:])  # (K, M, N, n_in)
+        x = x.flatten(1, 2) if self.shared else x.transpose(1, 2).flatten(0, 1)
+        for layer in layers[:-1]:
+            x = torch.relu(_products(x, *layer))
+        weight, bias = layers[-1]
+        if weight.shape[-2] > 1:
+            x = _products(x, weight, bias).unflatten(0, (k, -1))
+        else:  # sums over one output are added up in another order when they are batched
+            own = (part.unflatten(0, (k, -1)) for part in (x, weight, bias))
+            x = torch.stack([_products(*one) for one in zip(*own, strict=True)])
+        x = x if self.shared else x.transpose(1, 2)  # (K, 1, M N, n_out) or (K, M, N, n_out)
+        return x.reshape(*shape[:-1], x.shape[-1])
+
+    def _alone(self, x: Tensor, layers: Layers) -> Tensor:
+        if self.shared:
             for k, (weight, bias) in enumerate(layers):
                 x = nn.functional.linear(x if k == 0 else torch.relu(x), weight, bias)
             return x
         batch = x.shape[:-2]
         x = x.reshape(-1, *x.shape[-2:]).transpose(0, 1)
         for k, (weight, bias) in enumerate(layers):
-            x = torch.baddbmm(bias.unsqueeze(1), x if k == 0 else torch.relu(x), weight.mT)
+            x = _products(x if k == 0 else torch.relu(x), weight, bias)
         return x.transpose(0, 1).reshape(*batch, x.shape[0], x.shape[-1])
+
+
+def _products(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """``(K, M, n_in), (K, n_out, n_in), (K, n_out) -> (K, M, n_out)``."""
+    return torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
 
 def layers_of(params: TensorDictBase) -> Layers:
@@ -69,13 +100,16 @@ class BallActor(nn.Module):
         n_observation: size of a robot's observation.
         world: number of robots, dimension, speed.
         agent: layers and sharing.
+        n_learners: as :class:`BatchedMLP`'s.
     """
 
-    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> None:
+    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig, n_learners: int = 1) -> None:
         super().__init__()
         self.max_speed = world.max_speed
         self.net = BatchedMLP(
-            *(n_observation, world.dimension, world.n_agents, list(agent.actor_cells)), share_params=agent.share_params
+            *(n_observation, world.dimension, world.n_agents, list(agent.actor_cells)),
+            share_params=agent.share_params,
+            n_learners=n_learners,
         ).to(world.torch_dtype)
         # Small last layers: the first policies move slowly instead of at a random full speed (DDPG, section 7).
         last = str(2 * len(agent.actor_cells))
@@ -103,9 +137,10 @@ class Critic(nn.Module):
         n_observation: size of a robot's observation.
         world: number of robots, dimension, speed.
         agent: algorithm, state, layers and sharing.
+        n_learners: as :class:`BatchedMLP`'s.
     """
 
-    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> None:
+    def __init__(self, n_observation: int, world: SurveillanceConfig, agent: AgentConfig, n_learners: int = 1) -> None:
         super().__init__()
         self.world = world
         self.centralized = agent.algorithm == "maddpg"
@@ -114,9 +149,9 @@ class Critic(nn.Module):
         n = world.n_agents
         n_in = (n if self.concatenated else 1) * n_observation + (n if self.centralized else 1) * world.dimension
         n_in += self.foresight.n_features if self.foresight else 0
-        self.net = BatchedMLP(n_in, 1, n, list(agent.critic_cells), share_params=agent.share_params).to(
-            world.torch_dtype
-        )
+        self.net = BatchedMLP(
+            *(n_in, 1, n, list(agent.critic_cells)), share_params=agent.share_params, n_learners=n_learners
+        ).to(world.torch_dtype)
         with torch.no_grad():
             self.net.params[str(2 * len(agent.critic_cells))]["bias"].add_(agent.initial_reward / (1 - agent.gamma))
 
@@ -204,6 +239,10 @@ class ExplorationNoise(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add noise to ("agents", "nominal_action") in place of it."""
         action, step = tensordict[keys.NOMINAL_ACTION], tensordict[keys.STEP_COUNT]
+        return tensordict.set(keys.NOMINAL_ACTION, self.explore(action, step))
+
+    def explore(self, action: Tensor, step: Tensor) -> Tensor:
+        """``(B, N, d)`` nominal actions and ``(B, 1)`` steps since the episodes began; returns the noisy actions."""
         noise = torch.randn(action.shape, generator=self.generator, dtype=action.dtype, device=action.device)
         if self.agent.noise == "ou":
             keep = 1 - self.agent.ou_theta
@@ -212,9 +251,8 @@ class ExplorationNoise(TensorDictModuleBase):
                 noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, self.process)
             self.process = noise
         size = self.sigma * self.max_speed * self.spread(action)
-        tensordict.set(keys.NOMINAL_ACTION, action + size * noise)
         self.frames += step.numel()
-        return tensordict
+        return action + size * noise
 
     def spread(self, action: Tensor) -> Tensor:
         """Share of sigma for each world, evenly over ``[1 - noise_spread, 1]``, ``(*B, 1, 1)``."""
@@ -232,16 +270,38 @@ class ExplorationNoise(TensorDictModuleBase):
         self.frames, self.process = state["frames"], state["process"]
 
 
-def make_actor(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictModule:
+class NoiseOfSeeds(TensorDictModuleBase):
+    """Exploration noise of several learners, each on its block of the worlds.
+
+    Args:
+        parts: the noise of each.
+    """
+
+    def __init__(self, parts: list[ExplorationNoise]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = parts[0].in_keys, parts[0].out_keys
+        self.parts = nn.ModuleList(parts)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add noise to ("agents", "nominal_action") in place of it."""
+        blocks = [tensordict[key].chunk(len(self.parts)) for key in (keys.NOMINAL_ACTION, keys.STEP_COUNT)]
+        noisy = [noise.explore(*block) for noise, *block in zip(self.parts, *blocks, strict=True)]
+        return tensordict.set(keys.NOMINAL_ACTION, torch.cat(noisy))
+
+
+def make_actor(
+    n_observation: int, world: SurveillanceConfig, agent: AgentConfig, n_learners: int = 1
+) -> TensorDictModule:
     """Actor networks as a module from observation to nominal action."""
-    return TensorDictModule(
-        BallActor(n_observation, world, agent), in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION]
-    )
+    actor = BallActor(n_observation, world, agent, n_learners)
+    return TensorDictModule(actor, in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION])
 
 
-def make_critic(n_observation: int, world: SurveillanceConfig, agent: AgentConfig) -> TensorDictSequential:
+def make_critic(
+    n_observation: int, world: SurveillanceConfig, agent: AgentConfig, n_learners: int = 1
+) -> TensorDictSequential:
     """Critic networks as joint action, then value."""
-    critic = Critic(n_observation, world, agent)
+    critic = Critic(n_observation, world, agent, n_learners)
 
     def join(action: Tensor) -> Tensor:
         return joint_action(action, action, centralized=critic.centralized)
@@ -257,7 +317,7 @@ def make_policies(
     world: SurveillanceConfig,
     safety: SafetyConfig,
     agent: AgentConfig,
-    seed: int,
+    seed: int | list[int],
     device: torch.device,
     *,
     compile: bool = False,
@@ -269,7 +329,7 @@ def make_policies(
         world: the world.
         safety: the filter.
         agent: the noise.
-        seed: seed of the noise.
+        seed: seed of the noise; a list: one per learner, each with its block of the worlds.
         device: of the noise's generator.
         compile: the filter's pure functions, see :class:`safety.SafetyFilter`.
 
@@ -277,5 +337,8 @@ def make_policies(
         ``(policy, explore_policy)``; both execute filtered actions only.
     """
     safety_filter = SafetyFilter(safety, world, compile=compile)
-    noise = ExplorationNoise(agent, world, seed, device)
+    if isinstance(seed, list):
+        noise = NoiseOfSeeds([ExplorationNoise(agent, world, own, device) for own in seed])
+    else:
+        noise = ExplorationNoise(agent, world, seed, device)
     return TensorDictSequential(actor, safety_filter), TensorDictSequential(actor, noise, safety_filter)

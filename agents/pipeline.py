@@ -122,31 +122,24 @@ class MultiStep:
     Args:
         n_steps: 1 passes the transitions through as they are.
         gamma: discount per step.
+        n_blocks: equal blocks of worlds whose waiting steps are saved apart.
     """
 
-    def __init__(self, n_steps: int, gamma: float) -> None:
+    def __init__(self, n_steps: int, gamma: float, n_blocks: int = 1) -> None:
         self.n_steps, self.gamma = n_steps, gamma
-        self.waiting: TensorDictBase | None = None
-
-    def state_dict(self) -> dict:
-        """The steps that wait, for checkpoints."""
-        if self.waiting is None:
-            return {"waiting": None}
-        return {"waiting": self.waiting.to_dict(), "shape": list(self.waiting.shape)}
-
-    def load_state_dict(self, state: dict) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        waiting = state["waiting"]
-        self.waiting = None if waiting is None else TensorDict(waiting, state["shape"])
+        self.waiting: list[TensorDictBase | None] = [None] * n_blocks
+        self.blocks = [WaitingSteps(self, k) for k in range(n_blocks)]
 
     def __call__(self, transitions: TensorDictBase) -> TensorDictBase:
         """``(num_envs, T) -> (num_envs * T,)``, less than that at the start."""
         if self.n_steps == 1:
             return transitions.reshape(-1)
-        window = transitions
-        if self.waiting is not None:
-            window = cast(TensorDictBase, torch.cat([self.waiting, transitions], dim=1))  # pyright: ignore[reportArgumentType]
-        self.waiting = window[:, max(0, window.shape[1] - self.n_steps + 1) :].clone()
+        window, waiting = transitions, [steps for steps in self.waiting if steps is not None]
+        if waiting:
+            parts = [torch.cat(waiting), transitions]  # pyright: ignore[reportArgumentType]
+            window = cast(TensorDictBase, torch.cat(parts, dim=1))  # pyright: ignore[reportArgumentType]
+        newest = window[:, max(0, window.shape[1] - self.n_steps + 1) :].clone()
+        self.waiting = list(newest.chunk(len(self.waiting)))
         length = window.shape[1] - self.n_steps + 1
         if length <= 0:
             return transitions.reshape(-1)[:0]
@@ -162,3 +155,25 @@ class MultiStep:
         last = following.gather(1, torch.arange(length, device=done.device) + ahead).set(keys.REWARD, total)
         steps = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
         return window[:, :length].exclude("next").set(STEPS, steps).set("next", last).reshape(-1)
+
+
+class WaitingSteps:
+    """The waiting steps of a block of worlds, for checkpoints.
+
+    Args:
+        multi_step: what they wait for.
+        k: which block.
+    """
+
+    def __init__(self, multi_step: MultiStep, k: int) -> None:
+        self.multi_step, self.k = multi_step, k
+
+    def state_dict(self) -> dict:
+        """The steps that wait."""
+        waiting = self.multi_step.waiting[self.k]
+        return {"waiting": None} if waiting is None else {"waiting": waiting.to_dict(), "shape": list(waiting.shape)}
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        waiting = state["waiting"]
+        self.multi_step.waiting[self.k] = None if waiting is None else TensorDict(waiting, state["shape"])

@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ from agents.evaluation import rollout_steps
 # Overrides that belong to the world or to no method: they do not name one.
 UNNAMED = {
     "seed",
+    "seeds",
+    "n_seeds",
     "env",
     "device",
     "threads",
@@ -82,7 +84,7 @@ def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run
     """
     if not sweep.is_dir():
         raise ReportError(f"sweep={sweep} is not a folder.")
-    found = [run for folder in _run_folders(sweep) if (run := read_run(folder, sweep, config_hash))]
+    found = [run for folder in run_folders(sweep) if (run := read_run(folder, sweep, config_hash))]
     if not found:
         raise ReportError(
             f"sweep={sweep} holds no runs: no folder below it was written by train.py or by evaluate.py controller=…"
@@ -90,14 +92,21 @@ def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run
     return sorted(found, key=lambda run: (run.world, run.method, run.seed, run.name))
 
 
-def _run_folders(sweep: Path) -> Iterable[Path]:
+def run_folders(sweep: Path) -> Iterable[Path]:
+    """Folders below ``sweep`` that hold a run, whoever wrote it; what lies inside one is not looked at."""
     for path, names, _ in os.walk(sweep):
         folder = Path(path)
-        if (folder / ".hydra" / "config.yaml").is_file():
+        if (folder / ".hydra" / "config.yaml").is_file() and not _of_several_seeds(folder):
             names.clear()
             yield folder
         else:
             names[:] = [name for name in names if not re.fullmatch(r"replaced_\d+|\..*", name)]
+
+
+def _of_several_seeds(folder: Path) -> bool:
+    """Whether the folder is that of a program whose runs have folders of their own."""
+    config = OmegaConf.load(folder / ".hydra" / "config.yaml")
+    return config.get("seeds") is not None or config.get("n_seeds", 1) > 1
 
 
 def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]) -> Run | None:
@@ -258,18 +267,26 @@ def _listed(title: str, names: list[str], shown: int | None = SHOWN) -> str:
     return f"{title}: {', '.join(names[:shown])}{more}"
 
 
-def read_curves(run: Run) -> dict[str, np.ndarray]:
-    """What a training run logged, by TensorBoard tag.
+@dataclass
+class Events:
+    """What a training run logged, by TensorBoard tag."""
 
-    Returns:
-        Arrays ``(T, 3)``: frames (ascending, no two the same), seconds since the first event, value. Empty where there
-        are no events.
-    """
-    events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0}).Reload()
-    tags = events.Tags()["scalars"]
-    start = events.FirstEventTimestamp() if tags else 0.0
-    curves = {}
-    for tag in tags:
-        last = {entry.step: (entry.wall_time - start, entry.value) for entry in events.Scalars(tag)}  # of a resumed run
-        curves[tag] = np.array([(step, *last[step]) for step in sorted(last)], dtype=float)
-    return curves
+    start: float = 0.0
+    """Wall time of the first event, s."""
+    points: dict[str, np.ndarray] = field(default_factory=dict)
+    """``(T, 3)``: frames (ascending, no two the same), wall time (s), value."""
+
+    def curves(self) -> dict[str, np.ndarray]:
+        """The points with seconds since the first event in the place of wall times."""
+        return {tag: points - (0.0, self.start, 0.0) for tag, points in self.points.items()}
+
+
+def read_events(folder: Path, tags: Collection[str]) -> Events:
+    """What the run in ``folder`` logged of ``tags``; nothing where there are no events."""
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    logged = Events()
+    for tag in sorted(set(tags).intersection(events.Tags()["scalars"])):
+        logged.start = events.FirstEventTimestamp()
+        last = {entry.step: (entry.wall_time, entry.value) for entry in events.Scalars(tag)}  # of a resumed run
+        logged.points[tag] = np.array([(step, *last[step]) for step in sorted(last)], dtype=float)
+    return logged

@@ -9,7 +9,7 @@ bootstrap, probability of improvement).
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,13 @@ ALL = "all worlds"
 BOUND = "unlimited batteries"
 COST = "eval.coverage_cost"
 RATES = ("intervention", "hold", "homing")
+LOGGED = {
+    "coverage_cost": "eval/coverage_cost",
+    "intervention_rate": "filter/intervention_rate",
+    "homing_rate": "filter/homing_rate",
+    "fallback_rate": "filter/fallback_rate",
+}
+"""TensorBoard tags that the curves are made of."""
 BATCH = 2_000_000  # resampled numbers in memory at a time
 POINTS = 25  # of a curve of rates: finer, the phase of the episodes shows, which start together in all worlds
 
@@ -244,14 +251,14 @@ class Curve:
 
 
 def compute_curves(
-    groups: Groups, bootstrap: Bootstrap, read: Callable[[Run], dict[str, np.ndarray]]
+    groups: Groups, bootstrap: Bootstrap, read: Callable[[Run], Mapping[str, np.ndarray]]
 ) -> tuple[list[Curve], list[str]]:
     """Learning curves of J and of the filter's rates.
 
     Args:
         groups: the runs.
         bootstrap: the bands.
-        read: a run's logged scalars by tag, ``(T, 3)``, such as :func:`agents.report_runs.read_curves`.
+        read: a run's logged scalars by tag, ``(T, 3)``, such as :meth:`agents.report_runs.Events.curves`.
 
     Returns:
         The curves, and a warning per method of which a run logged nothing.
@@ -260,7 +267,9 @@ def compute_curves(
     for (world, method), runs in groups.runs.items():
         logged = [_logged(read(run)) for run in runs if run.learned]
         if any(not entry for entry in logged):
-            warnings.append(f"{world} / {method}: no TensorBoard events in {sum(not e for e in logged)} runs")
+            warnings.append(
+                f"{world} / {method}: no TensorBoard events in {sum(not e for e in logged)} runs: no curves of them"
+            )
         for quantity in ("coverage_cost", *(f"{name}_rate" for name in RATES)):
             if not (found := [entry[quantity] for entry in logged if quantity in entry]):
                 continue
@@ -278,11 +287,9 @@ def compute_curves(
     return curves, warnings
 
 
-def _logged(tags: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    names = {"coverage_cost": "eval/coverage_cost", "intervention_rate": "filter/intervention_rate"}
-    names["homing_rate"] = "filter/homing_rate"
-    found = {name: tags[tag] for name, tag in names.items() if tag in tags}
-    fallback, homing = tags.get("filter/fallback_rate"), found.get("homing_rate")
+def _logged(tags: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    found = {name: tags[tag] for name, tag in LOGGED.items() if tag in tags}
+    fallback, homing = found.pop("fallback_rate", None), found.get("homing_rate")
     if fallback is not None and homing is not None and len(fallback) == len(homing):
         found["hold_rate"] = fallback - homing * (0.0, 0.0, 1.0)
     return found

@@ -15,6 +15,7 @@ from agents.checkpoint import (
     FORMAT,
     CheckpointError,
     checkpoints,
+    frames_of,
     keep_newest,
     load_checkpoint,
     save_checkpoint,
@@ -55,7 +56,7 @@ class TrainingState:
         self.replay = ReplayFiles(self.folder / "replay", buffer) if with_buffer else None
 
     def save(self, *, ended: bool = False) -> Path:
-        """Write a checkpoint; the previous ones stay until it is complete.
+        """Write a checkpoint; the previous ones stay until :meth:`tidy`.
 
         Args:
             ended: the run collects no more; going on from here needs no replay rows.
@@ -74,11 +75,18 @@ class TrainingState:
             "replay": None if self.replay is None else self.replay.save(),
         }
         content["actor"] = content["parts"]["actor"]  # the policy, where every reader finds it
-        path = save_checkpoint(self.folder / f"frames_{frames:012d}.pt", content)
+        return save_checkpoint(self.folder / f"frames_{frames:012d}.pt", content)
+
+    def tidy(self) -> None:
+        """Delete the checkpoints and replay rows that are no longer kept."""
         keep_newest(self.folder, self.keep)
         if self.replay is not None:
             self.replay.prune()
-        return path
+
+    def newest_frames(self, tell: Callable[[str], None]) -> int | None:
+        """Frames of the newest valid checkpoint of this run's folder; None if there is none."""
+        found = newest_valid(self.folder, tell)
+        return None if found is None else found[1]["frames"]
 
     def save_best(self) -> None:
         """Write the policy alone to ``best.pt``: the one with the least coverage cost in an evaluation so far."""
@@ -90,13 +98,19 @@ class TrainingState:
         if self.replay is not None:
             self.replay.clear()
 
-    def resume(self, resume: str, tell: Callable[[str], None]) -> bool:
+    def saved_frames(self) -> set[int]:
+        """Frames of this folder's checkpoints, 0 for a run that never was far from its start."""
+        found = {frames_of(path) for path in checkpoints(self.folder)}
+        return found if found else {0}
+
+    def resume(self, resume: str, tell: Callable[[str], None], latest: int | None = None) -> bool:
         """Restore what ``resume`` names.
 
         Args:
             resume: ``auto``: the newest valid checkpoint of this run's folder, if there is one; ``never``: none; a
                 checkpoint or a run's folder: that one, unless it is of another folder and this run has its own.
             tell: shows a line to the user.
+            latest: ``auto``: pass over checkpoints of more frames than this.
 
         Returns:
             Whether the replay buffer is the one of the checkpoint; True where nothing was restored.
@@ -104,7 +118,7 @@ class TrainingState:
         Raises:
             CheckpointError: if the checkpoint cannot be used; nothing has been restored then.
         """
-        found = None if resume == "never" else newest_valid(self.folder, tell)
+        found = None if resume == "never" else newest_valid(self.folder, tell, latest)
         if resume not in ("auto", "never"):
             path = Path(resume)
             elsewhere = (path if path.is_dir() else path.parent.parent).resolve() != self.folder.parent.resolve()
@@ -139,9 +153,17 @@ class TrainingState:
         return with_rows
 
 
-def newest_valid(folder: Path, tell: Callable[[str], None]) -> tuple[Path, dict] | None:
-    """The newest checkpoint of a ``checkpoints`` folder that a run can go on from, with its content; None if there is none."""
+def newest_valid(folder: Path, tell: Callable[[str], None], latest: int | None = None) -> tuple[Path, dict] | None:
+    """The newest checkpoint of a ``checkpoints`` folder that a run can go on from, with its content; None if there is none.
+
+    Args:
+        folder: where to look.
+        tell: shows a line for each one that is damaged.
+        latest: of at most this many frames.
+    """
     for path in reversed(checkpoints(folder)):
+        if latest is not None and frames_of(path) > latest:
+            continue
         try:
             return path, load_resumable(path)
         except CheckpointError as error:

@@ -20,9 +20,10 @@ from agents.divergence import DivergedError
 from agents.incident import ViolationError
 from agents.interruption import InterruptedRunError, sweep_stops
 from agents.report_runs import ReportError
+from agents.run import SeedsFailedError
 from conf.command_line import fail, wants_traceback
 from conf.job_log import FAILED, LOG, JobLog, keep_failure
-from conf.run_folder import BusyFolderError, finished_run, foreign_run, only_writer
+from conf.run_folder import BusyFolderError, finished_program, only_writer
 from conf.schema import check_evaluation, check_training, to_config
 from conf.tuning import go_on
 
@@ -32,6 +33,7 @@ EXPECTED_IN_RUN = (
     CheckpointError,
     DivergedError,
     ReportError,
+    SeedsFailedError,
     ViolationError,
     OSError,
     OmegaConfBaseException,
@@ -53,10 +55,7 @@ class ValidateConfig(Callback):
         message = None
         try:
             self.check(config)
-            folder = Path(str(config.hydra.run.dir))
-            message = finished_run(folder, config.get("resume"))
-            if message and (foreign := foreign_run(folder, config)):
-                raise ValueError(foreign)
+            message = self.finished(config)
         except EXPECTED as error:
             if config.get("debug", False):
                 traceback.print_exception(error)
@@ -65,6 +64,11 @@ class ValidateConfig(Callback):
         if message:  # before Hydra rewrites .hydra/
             sys.stderr.write(message + "\n")
             sys.exit(0)
+
+    @staticmethod
+    def finished(cfg: DictConfig) -> str | None:
+        """What to say where there is nothing left to do."""
+        return None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Before the sweeper exists."""
@@ -96,6 +100,7 @@ class ValidateTraining(ValidateConfig):
     """The same for train.py, with the checkpoint that ``resume`` names."""
 
     check = staticmethod(check_training)
+    finished = staticmethod(finished_program)
 
 
 class ValidateEvaluation(ValidateConfig):

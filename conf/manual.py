@@ -7,6 +7,7 @@ import functools
 import inspect
 import textwrap
 import typing
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -56,6 +57,15 @@ def defaults(schema: type) -> dict[str, Any]:
         value = entry.default if factory is dataclasses.MISSING else factory()
         values[entry.name] = dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value  # pyright: ignore[reportArgumentType]
     return walk(values, "")
+
+
+def groups(*names: str) -> str:
+    """One paragraph per group: the files to choose from."""
+    lines: list[str] = []
+    for name in names:
+        options = ", ".join(sorted(path.stem for path in (Path(__file__).parent / name).glob("*.yaml")))
+        lines += textwrap.wrap(f"{name}: {options}", WIDTH, initial_indent="  ", subsequent_indent="      ")
+    return "\n".join(lines)
 
 
 def manual(schema: type) -> str:

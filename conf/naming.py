@@ -10,7 +10,23 @@ from omegaconf import DictConfig, OmegaConf
 from agents.evaluation import rollout_steps
 
 # Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = ("seed", "device", "threads", "deterministic", "resume", "debug", "checkpoint", "log", "hydra", "folder")
+NOT_HASHED = (
+    "seed",
+    "seeds",
+    "n_seeds",
+    "device",
+    "threads",
+    "deterministic",
+    "resume",
+    "debug",
+    "checkpoint",
+    "log",
+    "hydra",
+    "folder",
+    *("video", "format", "samples"),  # of evaluate.py's pictures
+)
+
+GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
 
 def config_hash(cfg: DictConfig) -> str:
@@ -21,6 +37,31 @@ def config_hash(cfg: DictConfig) -> str:
 def hashed_config(cfg: DictConfig) -> dict:
     """The resolved configuration without :data:`NOT_HASHED`, nested."""
     return {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
+
+
+def run_name(cfg: DictConfig, seed: int) -> str:
+    """Name of the folder of a seed's run."""
+    return f"{config_hash(cfg)}_seed{seed}"
+
+
+def program_name(cfg: DictConfig) -> str:
+    """Name of Hydra's folder: the run's, or where several seeds are trained at once one of their own beside the runs'."""
+    seeds = seeds_of(cfg)
+    if len(seeds) == 1:
+        return run_name(cfg, seeds[0])
+    if seeds == list(range(seeds[0], seeds[0] + len(seeds))):
+        label = f"{seeds[0]}-{seeds[-1]}"
+    else:
+        label = "_".join(map(str, seeds))
+        label = label if len(label) < 40 else f"{len(seeds)}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+    return f"{config_hash(cfg)}_seeds{label}"
+
+
+def seeds_of(cfg: DictConfig) -> list[int]:
+    """Seeds of a composed, not yet checked configuration of train.py."""
+    if cfg.seeds:
+        return list(cfg.seeds)
+    return [cfg.seed + k for k in range(max(1, cfg.n_seeds))]
 
 
 def _plain(cfg: DictConfig, name: str) -> Any:

@@ -24,6 +24,10 @@ class ReportConfig:
     """Of the intervals, 0.5..0.999."""
     seed: int = 0
     """Seed of the resampling, 0..2^31."""
+    pack: str | None = None
+    """After the report, write what it needs of the finished runs to this file (.tar.xz, some kB per run)."""
+    unpack: str | None = None
+    """Put the runs of such a file below sweep, those left alone that are there already, and make no report."""
     debug: bool = False
     """Show tracebacks."""
 
@@ -31,6 +35,10 @@ class ReportConfig:
         """Check every field."""
         if self.sweep is None:
             raise ValueError("sweep=<folder> is missing: the folder that holds the runs, such as sweep=runs/default.")
+        if self.pack is not None and not self.pack.endswith(".tar.xz"):
+            raise ValueError(f"pack={self.pack}: the archive's name must end with .tar.xz.")
+        if self.unpack is not None and self.pack is not None:
+            raise ValueError(f"pack={self.pack} unpack={self.unpack}: unpack makes no report; give one of the two.")
         check_range("resamples", self.resamples, 100, 10**6)
         check_range("confidence", self.confidence, 0.5, 0.999)
         check_range("seed", self.seed, 0, 2**31)

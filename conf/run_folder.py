@@ -2,13 +2,13 @@
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from tqdm import tqdm
 
-from conf.naming import config_hash
+from conf.naming import config_hash, program_name, run_name, seeds_of
 from envs import SurveillanceConfig
 from envs.inequalities import derived_quantities
 
@@ -22,11 +22,60 @@ class BusyFolderError(ValueError):
     """A run's folder that another process is writing."""
 
 
-def announce_certificate(folder: Path, world: SurveillanceConfig) -> None:
+def announce_certificate(folder: Path, world: SurveillanceConfig, *, show: bool = True) -> None:
     """Show the quantities that the certificate of ``world`` derives, once, and keep them in ``certificate.json``."""
     certificate = derived_quantities(world)
     write_json(folder / "certificate.json", certificate)
-    tqdm.write("certificate: " + ", ".join(f"{name} {value:.4g}" for name, value in certificate.items()))
+    if show:
+        tqdm.write("certificate: " + ", ".join(f"{name} {value:.4g}" for name, value in certificate.items()))
+
+
+def run_folders(cfg: DictConfig, seeds: list[int], output: Path) -> dict[int, Path]:
+    """The folder of each seed's run: Hydra's run folder, or where there are several those beside it (inside a folder that the
+    user named).
+    """
+    if len(seeds) == 1:
+        return {seeds[0]: output}
+    if output.name == program_name(cfg):
+        return {seed: output.parent / run_name(cfg, seed) for seed in seeds}
+    return {seed: output / f"seed{seed}" for seed in seeds}
+
+
+def unfinished_seeds(cfg: DictConfig, seeds: list[int], output: Path, tell: Callable[[str], None]) -> dict[int, Path]:
+    """Make the folders of the runs that are still to be trained, each with a ``.hydra`` as of a run of its own.
+
+    Args:
+        cfg: the composed configuration.
+        seeds: all seeds.
+        output: Hydra's run folder.
+        tell: shows a line for each finished run.
+
+    Returns:
+        Folders by seed, without those of finished runs.
+    """
+    folders = {}
+    for seed, folder in run_folders(cfg, seeds, output).items():
+        if message := finished_run(folder, cfg.resume):
+            tell(message)
+            continue
+        folders[seed] = folder
+        if cfg.seeds is not None or cfg.n_seeds != 1:
+            _write_hydra_files(cfg, seed, folder, output)
+    return folders
+
+
+def _write_hydra_files(cfg: DictConfig, seed: int, folder: Path, output: Path) -> None:
+    own, source, target = cfg.copy(), output / ".hydra", folder / ".hydra"
+    with open_dict(own):
+        own.pop("hydra", None)
+    own.seed, own.seeds, own.n_seeds = seed, None, 1
+    hydra = OmegaConf.load(source / "hydra.yaml")
+    task = [entry for entry in hydra.hydra.overrides.task if entry.split("=")[0] not in ("seed", "seeds", "n_seeds")]
+    hydra.hydra.overrides.task = [*task, f"seed={seed}"]
+    target.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(own, target / "config.yaml")
+    OmegaConf.save(hydra, target / "hydra.yaml")
+    OmegaConf.save(hydra.hydra.overrides.task, target / "overrides.yaml")
 
 
 def finished_evaluation(path: Path, asked: dict) -> bool:
@@ -35,6 +84,20 @@ def finished_evaluation(path: Path, asked: dict) -> bool:
         return False
     content = json.loads(path.read_text())
     return all(content.get(name) == value for name, value in asked.items())
+
+
+def finished_program(cfg: DictConfig) -> str | None:
+    """What to tell the user if all runs of a program of train.py are finished and to be left alone; None otherwise."""
+    folders = run_folders(cfg, seeds_of(cfg), Path(str(cfg.hydra.run.dir)))
+    messages = [finished_run(folder, cfg.resume) for folder in folders.values()]
+    foreign = [
+        foreign_run(folder, cfg, seed)
+        for (seed, folder), message in zip(folders.items(), messages, strict=True)
+        if message
+    ]
+    if any(foreign):
+        raise ValueError(next(filter(None, foreign)))
+    return "\n".join(filter(None, messages)) if all(messages) else None
 
 
 def finished_run(folder: Path, resume: str | None) -> str | None:
@@ -46,27 +109,30 @@ def finished_run(folder: Path, resume: str | None) -> str | None:
     return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
 
 
-def foreign_run(folder: Path, config: DictConfig) -> str | None:
-    """What is wrong with ``folder`` if it holds a training run of another configuration or seed than ``config``."""
+def foreign_run(folder: Path, cfg: DictConfig, seed: int) -> str | None:
+    """What is wrong with ``folder`` if it holds a training run of another configuration than ``cfg``, or of another seed."""
     path = folder / ".hydra" / "config.yaml"
-    digest = config_hash(config) if "collector" in config else ""
-    if not digest or folder.name == f"{digest}_seed{config.seed}" or not path.is_file():
+    if folder.name == run_name(cfg, seed) or not path.is_file():
         return None
-    there = OmegaConf.load(path)
-    if not isinstance(there, DictConfig) or (there.get("seed"), config_hash(there)) == (config.seed, digest):
+    there, digest = OmegaConf.load(path), config_hash(cfg)
+    if not isinstance(there, DictConfig) or (there.get("seed"), config_hash(there)) == (seed, digest):
         return None
     return (
         f"{folder} holds a run of another configuration (hash {config_hash(there)}, seed {there.get('seed')}; this one: "
-        f"{digest}, seed {config.seed}): give this run another folder (hydra.run.dir, hydra.sweep.dir, hydra.sweep.subdir), "
+        f"{digest}, seed {seed}): give this run another folder (hydra.run.dir, hydra.sweep.dir, hydra.sweep.subdir), "
         "or move that one away."
     )
 
 
-def objective(folder: Path) -> float | None:
-    """The coverage cost that a finished run was evaluated with, m²: what a sweep for tuning makes small. None without one."""
+def objective(folders: Iterable[Path]) -> float | None:
+    """The coverage cost that finished runs were evaluated with, their mean, m²: what a sweep for tuning makes small.
+
+    None where one of them has none.
+    """
     try:
-        return float(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["eval"]["coverage_cost"])
-    except (OSError, ValueError, KeyError, TypeError):
+        summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
+        return sum(float(summary["eval"]["coverage_cost"]) for summary in summaries) / len(summaries)
+    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
         return None
 
 

@@ -28,7 +28,8 @@ from tqdm import tqdm
 from agents.interruption import STOP_FILE, InterruptedRunError
 from conf.job_log import LOG, FailedRunError, read_failure
 from conf.launching import SweepError, check_launcher, is_broken_pool, patient, replaced
-from conf.run_folder import finished_run, foreign_run, objective
+from conf.naming import seeds_of
+from conf.run_folder import finished_run, foreign_run, objective, run_folders
 from conf.sweep_jobs import FAILED_JOBS, FailedJob, Job, is_listed, list_jobs, refuse_shared_folders
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
@@ -83,7 +84,7 @@ class SweepLauncher(Launcher):
                 job.end(JobStatus.FAILED, job.error)
             elif job.finished and not self.numbered:
                 tqdm.write(job.finished)
-                job.end(JobStatus.COMPLETED, objective(job.folder))
+                job.end(JobStatus.COMPLETED, objective(job.folders))
             else:
                 todo.append(job)
         if todo and self.basic:
@@ -109,9 +110,15 @@ class SweepLauncher(Launcher):
         except EXPECTED as error:
             job.error = error
             return job
-        if message := foreign_run(job.folder, config):
-            raise SweepError(f"{message} Nothing was started.")
-        job.finished = finished_run(job.folder, config.get("resume"))
+        job.folders = [job.folder]
+        if "collector" in config:  # training
+            own = run_folders(config, seeds_of(config), job.folder)
+            for seed, folder in own.items():
+                if message := foreign_run(folder, config, seed):
+                    raise SweepError(f"{message} Nothing was started.")
+            job.folders = list(own.values())
+            messages = [finished_run(folder, config.resume) for folder in job.folders]
+            job.finished = "\n".join(map(str, messages)) if all(messages) else None
         return job
 
     def _start(self, jobs: Sequence[Job], first: int) -> None:
@@ -159,7 +166,7 @@ class SweepLauncher(Launcher):
             if job.done(since) and (error := read_failure(job.folder)):
                 job.end(JobStatus.FAILED, error)
             elif job.done(since):
-                job.end(JobStatus.COMPLETED, objective(job.folder))
+                job.end(JobStatus.COMPLETED, objective(job.folders))
 
     def _conclude(self, jobs: Sequence[Job], first: dict[Path, Job]) -> Sequence[JobReturn]:
         for job in jobs:

@@ -11,9 +11,10 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
+from conf.job_log import FAILED
 from conf.launching import SweepError
 
-DONE = ("summary.json", "eval.json", "failed.json")
+SUMMARIES = ("summary.json", "eval.json")
 
 
 @dataclass
@@ -35,6 +36,8 @@ class Job:
 
     overrides: Sequence[str]
     folder: Path
+    folders: Sequence[Path] = ()
+    """Of its runs: that folder, or where it trains several seeds at once one of each."""
     finished: str | None = None
     """What to tell the user if it is finished and left alone."""
     error: BaseException | None = None
@@ -48,7 +51,11 @@ class Job:
 
     def done(self, since: float) -> bool:
         """Whether it has ended since that time."""
-        return any(path.exists() and path.stat().st_mtime >= since for path in map(self.folder.joinpath, DONE))
+
+        def written(folder: Path, *names: str) -> bool:
+            return any(path.exists() and path.stat().st_mtime >= since for path in map(folder.joinpath, names))
+
+        return written(self.folder, FAILED) or all(written(folder, *SUMMARIES) for folder in self.folders)
 
     def started(self, since: float) -> bool:
         """Whether it has begun since that time."""
@@ -89,8 +96,9 @@ def refuse_shared_folders(jobs: Sequence[Job]) -> None:
     for job in jobs:
         if job.error is not None:
             continue
-        other = seen.setdefault(job.folder.resolve(), job)
-        if other is job:
+        others = [seen.setdefault(folder.resolve(), job) for folder in {job.folder, *job.folders}]
+        other = next((other for other in others if other is not job), None)
+        if other is None:
             continue
         its = " ".join(entry for entry in other.overrides if entry not in job.overrides)
         mine = " ".join(entry for entry in job.overrides if entry not in other.overrides)

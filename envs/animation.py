@@ -1,4 +1,4 @@
-"""A GIF of one world drawn directly into pixels: about fifty times faster than :func:`envs.rendering.save_gif`.
+"""A GIF of one world drawn directly into pixels: about fifty times faster than :func:`envs.video.save_gif`.
 
 For TensorBoard and for long rollouts; worlds in three dimensions are seen from above. The colours, numbers and hatches
 are those of :mod:`envs.rendering`.
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -22,19 +23,21 @@ class Painter:
 
     Args:
         trajectory: the history.
-        height: pixels; the width follows from the arena, and a column for the batteries.
+        height: pixels at zoom 1; the width follows from the arena, and a column for the batteries.
+        zoom: factor of both, lines and letters included, >= 1.
     """
 
-    def __init__(self, trajectory: Trajectory, height: int = 300) -> None:
-        self.trajectory = trajectory
+    def __init__(self, trajectory: Trajectory, height: int = 300, zoom: int = 1) -> None:
+        self.trajectory, self.scale = trajectory, SCALE * zoom
         low, high = np.asarray(trajectory.arena, dtype=float)[:2].T
         room = np.concatenate([trajectory.stations, trajectory.slots])[:, :2]
         border = 0.12 * (high - low).max()
         self.low, self.high = np.minimum(low, room.min(0)) - border, np.maximum(high, room.max(0)) + border
-        self.unit = SCALE * (height - 24) / (self.high - self.low)[1]  # pixels per metre
+        self.unit = self.scale * (height - 24) / (self.high - self.low)[1]  # pixels per metre
         self.wide = round((self.high - self.low)[0] * self.unit)
-        self.size = (self.wide + 120 * SCALE, height * SCALE)
-        self.font, self.small = (ImageFont.load_default(size * SCALE) for size in (11, 9))
+        self.size = (self.wide + 120 * self.scale, height * self.scale)
+        face = Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")  # that of the figures
+        self.font, self.small = (ImageFont.truetype(face, size * self.scale) for size in (10, 8))
         self.ground = self._ground(0) if len(trajectory.density) == 1 else None
 
     def frame(self, k: int) -> Image.Image:
@@ -47,50 +50,51 @@ class Painter:
         if len(world.arena) == 2:
             for cell in voronoi_cells(here[shown], world.arena):
                 if len(cell) > 2:
-                    draw.line([*self._at(cell), *self._at(cell[:1])], fill="#555555", width=SCALE)
+                    draw.line([*self._at(cell), *self._at(cell[:1])], fill="#555555", width=self.scale)
         for i in np.flatnonzero(shown):
             self._robot(draw, k, i, here[i])
         self._batteries(draw, k)
-        title = f"t = {k * world.dt:.1f} s   J = {world.coverage_cost[k]:.3g}"
-        draw.text((6 * SCALE, 4 * SCALE), title, fill=INK, font=self.font)
+        title = f"t = {k * world.dt:.1f} s   J = {world.coverage_cost[k]:.3g} m²"
+        draw.text((6 * self.scale, 4 * self.scale), title, fill=INK, font=self.font)
         return image.reduce(SCALE)
 
     def _robot(self, draw: ImageDraw.ImageDraw, k: int, i: int, here: np.ndarray) -> None:
         world, colour, charging = self.trajectory, COLOURS[i % len(COLOURS)], bool(self.trajectory.charging[k, i])
         path = world.position[max(0, k - TRAIL) : k + 1, i, :2].astype(float)
         if np.isfinite(path).all() and len(path) > 1:
-            draw.line(self._at(np.clip(path, self.low, self.high)), fill=colour, width=2 * SCALE)
+            draw.line(self._at(np.clip(path, self.low, self.high)), fill=colour, width=2 * self.scale)
         ((x, y),) = self._at(here[None])
         half = world.safety_distance / 2 * self.unit
-        draw.ellipse((x - half, y - half, x + half, y + half), outline=colour, width=SCALE)
-        r = 8 * SCALE
-        ring = {"outline": INK, "width": 3 * SCALE} if charging else {"outline": "white", "width": SCALE}
+        draw.ellipse((x - half, y - half, x + half, y + half), outline=colour, width=self.scale)
+        r = 8 * self.scale
+        ring = {"outline": INK, "width": 3 * self.scale} if charging else {"outline": "white", "width": self.scale}
         draw.ellipse((x - r, y - r, x + r, y + r), fill=colour, **ring)
         draw.text((x, y), str(i + 1), fill=_ink(colour), font=self.small, anchor="mm")
 
     def _batteries(self, draw: ImageDraw.ImageDraw, k: int) -> None:
         """One bar per robot, from a quarter of the range below E_min to E_max; hatched while charging."""
         world, n = self.trajectory, self.trajectory.energy.shape[1]
-        left, right, top = self.wide + 22 * SCALE, self.wide + 102 * SCALE, 40 * SCALE
-        step = min(26 * SCALE, (self.size[1] - top - 20 * SCALE) // n)
+        left, right, top = self.wide + 22 * self.scale, self.wide + 102 * self.scale, 40 * self.scale
+        step = min(26 * self.scale, (self.size[1] - top - 32 * self.scale) // n)
         start = world.energy_min - 0.25 * (world.energy_max - world.energy_min)
 
         def at(energy: float) -> float:
             return left + (right - left) * (energy - start) / (world.energy_max - start)
 
-        draw.text((left, 22 * SCALE), "battery energy", fill=INK, font=self.small)
+        draw.text((left, 22 * self.scale), "battery energy", fill=INK, font=self.small)
         for i, energy in enumerate(world.energy[k].astype(float)):
             y0, y1, colour = top + i * step, top + i * step + 0.7 * step, COLOURS[i % len(COLOURS)]
             draw.rectangle((left, y0, right, y1), fill="white", outline=GREY)
             if np.isfinite(energy):
                 end = at(float(np.clip(energy, start, world.energy_max)))
                 draw.rectangle((left, y0, end, y1), fill=colour)
-                for x in np.arange(left, end - 3 * SCALE, 6 * SCALE) if world.charging[k, i] else ():
-                    draw.line((x, y1, x + 3 * SCALE, y0), fill=_ink(colour), width=SCALE)
-            draw.text((left - 5 * SCALE, (y0 + y1) / 2), str(i + 1), fill=INK, font=self.small, anchor="rm")
+                for x in np.arange(left, end - 3 * self.scale, 6 * self.scale) if world.charging[k, i] else ():
+                    draw.line((x, y1, x + 3 * self.scale, y0), fill=_ink(colour), width=self.scale)
+            draw.text((left - 5 * self.scale, (y0 + y1) / 2), str(i + 1), fill=INK, font=self.small, anchor="rm")
         x, end = at(world.energy_min), top + n * step
-        draw.line((x, top - 3 * SCALE, x, end), fill=INK, width=SCALE)
+        draw.line((x, top - 3 * self.scale, x, end), fill=INK, width=self.scale)
         draw.text((x, end), "min", fill=INK, font=self.small, anchor="ma")
+        draw.text((left, end + 14 * self.scale), "hatched: charging", fill=INK, font=self.small)
 
     def _ground(self, k: int) -> Image.Image:
         """Density, arena, stations and slots: what stays where it is."""
@@ -105,14 +109,15 @@ class Painter:
             field = Image.fromarray(grid.T[::-1].astype(np.float32)).resize(box, Image.Resampling.BICUBIC)
             colours = (DENSITY_MAP(np.asarray(field))[..., :3] * 255).astype(np.uint8)  # bands: small files
             image.paste(Image.fromarray(colours), (round(corner[0]), round(other[1])))
-        draw.rectangle((corner[0], other[1], other[0], corner[1]), outline=GREY, width=SCALE)
+        draw.rectangle((corner[0], other[1], other[0], corner[1]), outline=GREY, width=self.scale)
         for x, y in self._at(world.stations[:, :2]):
             r = world.charge_radius * self.unit
-            draw.ellipse((x - r, y - r, x + r, y + r), outline=GREEN, width=2 * SCALE)
-            draw.polygon([(x + 8 * SCALE * a, y - 8 * SCALE * b) for a, b in BOLT], fill=INK, outline="white")
+            draw.ellipse((x - r, y - r, x + r, y + r), outline=GREEN, width=2 * self.scale)
         for x, y in self._at(world.slots[:, :2]):
-            r = 3 * SCALE
-            draw.ellipse((x - r, y - r, x + r, y + r), fill="white", outline=INK, width=SCALE)
+            r = 6 * self.scale
+            draw.ellipse((x - r, y - r, x + r, y + r), fill="white", outline=INK, width=self.scale)
+        for x, y in self._at(world.stations[:, :2]):
+            draw.polygon([(x + 5 * self.scale * a, y - 5 * self.scale * b) for a, b in BOLT], fill=INK)
         return image
 
     def _at(self, points: np.ndarray) -> list[tuple[float, float]]:

@@ -62,8 +62,14 @@ def coverage_cost(position: Tensor, points: Tensor, weights: Tensor, cell_moment
 
 
 def weighted_sum(values: Tensor, weights: Tensor) -> Tensor:
-    """Sum over the quadrature points, ``(*B, Q)`` and ``(Q,)`` or ``(*B, Q)`` to ``(*B,)``."""
-    return values @ weights if weights.dim() == 1 else (values * weights).sum(-1)
+    """Sum over the quadrature points, ``(*B, Q)`` and ``(Q,)`` or ``(*B, Q)`` to ``(*B,)``.
+
+    Several batches ``(K, B, Q)`` give each the bits that it has alone: the order in which a matrix-vector product adds up
+    depends on the number of rows.
+    """
+    if weights.dim() > 1:
+        return (values * weights).sum(-1)
+    return values @ weights if values.dim() < 3 else torch.stack([weighted_sum(own, weights) for own in values])
 
 
 def voronoi_moments(
@@ -81,7 +87,7 @@ def voronoi_moments(
         Mass ``(*B, N)`` and centroid ``(*B, N, d)``, m; the centroid of a cell without mass is the robot itself.
     """
     squared = squared_distances(position, points) if squared is None else squared
-    nearest = squared.argmin(dim=-2, keepdim=True)
+    nearest = squared.min(dim=-2, keepdim=True).indices  # the first, as argmin, in a tenth of its time
     robots = torch.arange(position.shape[-2], device=position.device).unsqueeze(-1)
     owned = (nearest == robots).to(position.dtype) * weights.unsqueeze(-2)
     mass = owned.sum(-1)

@@ -1,4 +1,4 @@
-"""Pictures of a mission: the world at one instant, animations, battery traces and training curves.
+"""Pictures of a mission: the world at one instant, battery traces and training curves.
 
 NumPy arrays in, files out, on matplotlib's Agg canvas without pyplot state. Robots are numbered from 1. Colour
 (Okabe-Ito) is always backed up by a number, shape, line style or hatch: no picture depends on colour vision.
@@ -19,7 +19,6 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
-from PIL import Image
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#F0E442")
 MARKERS = ("o", "s", "D", "h")  # one shape per round of the eight colours
@@ -84,7 +83,7 @@ def _view(trajectory: Trajectory) -> np.ndarray:
     return view + np.stack([-extra, extra], axis=1)
 
 
-def _style(i: int) -> tuple[str, str, str]:
+def robot_style(i: int) -> tuple[str, str, str]:
     """Colour, marker and black or white (whichever reads better on the colour) of robot i."""
     colour = COLOURS[i % len(COLOURS)]
     return colour, MARKERS[i // 8 % 4], "black" if np.dot(to_rgb(colour), (0.21, 0.72, 0.07)) > 0.45 else "white"
@@ -104,7 +103,7 @@ def draw_density(ax: Axes, trajectory: Trajectory, k: int) -> AxesImage:
 
 def _draw_density_scale(ax: Axes, image: AxesImage) -> None:
     """Colour bar of the density in the column to the right."""
-    bar = ax.inset_axes((1.13, 0.06, 0.38, 0.025))
+    bar = ax.inset_axes((1.13, 0.05, 0.38, 0.025))
     ax.figure.colorbar(image, cax=bar, orientation="horizontal", ticks=[0.0, image.get_clim()[1]], format="%.2g")
     bar.set_title("density φ (1/m²)", fontsize=FONT, loc="left", pad=4)
     bar.tick_params(labelsize=FONT, length=2)
@@ -115,7 +114,7 @@ def _draw_batteries(panel: Axes, trajectory: Trajectory, k: int) -> None:
     low, high, n = trajectory.energy_min, trajectory.energy_max, trajectory.energy.shape[1]
     left = low - 0.25 * (high - low)  # a level below E_min, a violation, stays visible
     for i, energy in enumerate(trajectory.energy[k]):
-        (colour, _, ink), hatch = _style(i), "////" if trajectory.charging[k, i] else None
+        (colour, _, ink), hatch = robot_style(i), "////" if trajectory.charging[k, i] else None
         panel.add_patch(Rectangle((left, i - 0.36), high - left, 0.72, fc="white", ec=GREY, lw=0.8))
         if np.isfinite([energy, *trajectory.position[k, i]]).all():
             level = float(np.clip(energy, left, high)) - left
@@ -153,10 +152,10 @@ def draw_world(ax: Axes, trajectory: Trajectory, k: int) -> None:
             ax.plot_wireframe(*(ball + centre[:, None, None]), color=GREEN, lw=0.5, alpha=0.45)
             ax.computed_zorder = False  # keeps each number on its own disc
     loose = {"ls": "none", "clip_on": flat, "zorder": 4}
-    ax.plot(*trajectory.slots.T, marker="o", ms=5, mfc="white", mec=INK, **loose)
-    ax.plot(*trajectory.stations.T, marker=BOLT, ms=11, color=INK, mec="white", mew=0.6, **loose)
+    ax.plot(*trajectory.slots.T, marker="o", ms=11, mfc="white", mec=INK, mew=0.8, **loose)
+    ax.plot(*trajectory.stations.T, marker=BOLT, ms=8, color=INK, mew=0.0, **loose)
     for i in np.flatnonzero(((here >= view[:, 0]) & (here <= view[:, 1])).all(axis=1)):
-        (colour, marker, ink), slot, charging = _style(i), trajectory.slot[k, i], trajectory.charging[k, i]
+        (colour, marker, ink), slot, charging = robot_style(i), trajectory.slot[k, i], trajectory.charging[k, i]
         path = trajectory.position[max(0, k - TRAIL) : k + 1, i]
         segments = np.stack([path[:-1], path[1:]], axis=1)
         fade = np.linspace(0.1, 1.0, len(segments))[whole := np.isfinite(segments).all(axis=(1, 2))]
@@ -178,19 +177,26 @@ def draw_world(ax: Axes, trajectory: Trajectory, k: int) -> None:
         ax.set(**{f"{name}lim": limits, f"{name}label": f"{name} (m)"})
     ax.locator_params(nbins=5)
     ax.set_aspect("equal")
-    ax.set_title(f"t = {k * trajectory.dt:.1f} s,  coverage cost J = {trajectory.coverage_cost[k]:.3g}", fontsize=10)
-    _draw_batteries(ax.inset_axes((1.13, 0.52, 0.38, 0.44)), trajectory, k)
+    ax.set_title(f"t = {k * trajectory.dt:.1f} s,  coverage cost J = {trajectory.coverage_cost[k]:.3g} m²", fontsize=10)
+    # The column keeps its order in low Axes: density scale and legend have their size, the batteries take the rest.
+    inches = ax.get_position(original=True).height * ax.figure.get_figheight()
+    bottom = min((0.62 if flat else 0.1) / inches, 0.3)
+    bars = min(bottom + (1.6 if flat else 1.45) / inches, 0.8)
+    right = 1.13 if flat else 1.22  # of the z label
+    _draw_batteries(ax.inset_axes((right, bars, 0.38, 0.96 - bars)), trajectory, k)
     disc = {"marker": "o", "ms": 9, "mfc": "#bbbbbb"}
     key = [
-        Line2D([], [], **disc, mec="white", color=GREY, lw=2, label=f"robot, last {TRAIL} steps"),
+        Line2D([], [], **disc, mec="white", color=GREY, lw=2, label=f"robot, last {TRAIL * trajectory.dt:.3g} s"),
         Line2D([], [], **disc, mec=INK, mew=2, color=INK, ls=":", label="charging, way to slot"),
-        Line2D([], [], marker="o", ms=5, mfc="white", color=INK, ls="none", label="charging slot"),
-        Line2D([], [], marker=BOLT, ms=9, color=INK, ls="none", label="charging station"),
+        Line2D([], [], marker="o", ms=9, mfc="white", mew=0.8, color=INK, ls="none", label="charging slot"),
+        Line2D([], [], marker=BOLT, ms=8, color=INK, mew=0, ls="none", label="charging station"),
         Line2D([], [], color=GREEN, ls=(0, (4, 2)) if flat else "-", lw=1, label="charging range"),
         Line2D([], [], color="#555555", lw=1.1, label="Voronoi boundary"),
-        Line2D([], [], marker="o", ms=9, mfc="none", color=GREY, ls="none", label="half safety distance"),
+        Line2D([], [], marker="o", ms=12, mfc="none", color=COLOURS[0], ls="none", label="half safety distance"),
     ]
-    ax.legend(handles=key if flat else key[:5], fontsize=FONT, loc=(1.06, 0.14), labelspacing=0.3, frameon=False)
+    floor = [Line2D([], [], color=GREY, lw=0.8, ls=":", marker="x", ms=4, label="point below on the floor")]
+    handles = key if flat else key[:5] + floor
+    ax.legend(handles=handles, fontsize=FONT, loc=(right - 0.07, bottom), labelspacing=0.3, frameon=False)
 
 
 def _runs(flag: np.ndarray) -> np.ndarray:
@@ -226,49 +232,27 @@ def survey_charge_survey(trajectory: Trajectory) -> tuple[int, int, int]:
     return max(options, key=lambda option: option[0])[1] if options else (0, steps // 2, steps - 1)
 
 
-def _world_figure(trajectory: Trajectory, dpi: int) -> tuple[Figure, Axes]:
+def world_figure(trajectory: Trajectory, dpi: int) -> tuple[Figure, Axes]:
     """A figure with Axes for `draw_world`, sized to the arena; its fixed margins keep animations still."""
     sides = np.ptp(_view(trajectory), axis=1)
     width, height = 4.4 * sides / sides.max() if len(sides) == 2 else (4.4, 4.4)
     full = (width + 3.2, height + 0.95)  # inches
     figure = FigureCanvasAgg(Figure(figsize=full, dpi=dpi)).figure
-    place = (0.75 / full[0], 0.55 / full[1], width / full[0], height / full[1])
+    left = 0.75 if len(sides) == 2 else 0.35  # a 3-D view has its z label to the right
+    place = (left / full[0], 0.55 / full[1], width / full[0], height / full[1])
     return figure, figure.add_axes(place, projection=None if len(sides) == 2 else "3d")
 
 
 @rc_context(STYLE)
-def save_snapshots(trajectory: Trajectory, folder: str | Path) -> list[Path]:
-    """Writes surveying_1.png, charging.png and surveying_2.png (the paper's Figures 5 to 7); returns the paths."""
+def save_snapshots(trajectory: Trajectory, folder: str | Path, *, suffix: str = "png") -> list[Path]:
+    """Writes surveying_1, charging and surveying_2 (the paper's Figures 5 to 7); returns the paths."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    paths = [Path(folder) / f"{name}.png" for name in ("surveying_1", "charging", "surveying_2")]
+    paths = [Path(folder) / f"{name}.{suffix}" for name in ("surveying_1", "charging", "surveying_2")]
     for path, k in zip(paths, survey_charge_survey(trajectory), strict=True):
-        figure, ax = _world_figure(trajectory, dpi=180)
+        figure, ax = world_figure(trajectory, dpi=180)
         draw_world(ax, trajectory, k)
         figure.savefig(path)
     return paths
-
-
-@rc_context(STYLE)
-def save_gif(trajectory: Trajectory, path: str | Path, *, max_frames: int = 150, fps: float = 12) -> Path:
-    """Writes an animation of at most `max_frames` samples, evenly spread, at `fps` frames/s; returns the path."""
-    figure, ax = _world_figure(trajectory, dpi=78)
-
-    def frame(k: int) -> Image.Image:
-        ax.clear()  # drops the column to the right too
-        draw_world(ax, trajectory, int(k))
-        figure.canvas.draw()
-        return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3])
-
-    # One palette from the three phases for all frames: no flicker, and unchanged pixels compress to nothing.
-    phases = np.concatenate([np.asarray(frame(k)) for k in {*survey_charge_survey(trajectory)}])
-    palette = Image.fromarray(phases).quantize(160)
-    last = len(trajectory.position) - 1
-    chosen = np.unique(np.linspace(0, last, max(1, min(last + 1, max_frames))).round())
-    stream = (frame(k).quantize(palette=palette, dither=Image.Dither.NONE) for k in chosen)
-    options = {"append_images": stream, "duration": round(1000 / fps), "loop": 0}
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    next(stream).save(path, format="GIF", save_all=True, optimize=False, **options)
-    return Path(path)
 
 
 @rc_context(STYLE)
@@ -278,7 +262,7 @@ def save_battery_plot(trajectory: Trajectory, path: str | Path) -> Path:
     figure = Figure(figsize=(7.0, 4.7 + 0.19 * n), dpi=180, layout="constrained")
     top, rows, cost = figure.subplots(3, 1, sharex=True, height_ratios=(2.6, 0.35 + 0.19 * n, 1.0))
     for i in range(n):
-        colour, marker, ink = _style(i)
+        colour, marker, ink = robot_style(i)
         variant = (i + i // len(COLOURS)) % 4  # shifts by one per round, so that equal colours differ in style
         top.plot(np.arange(steps) * dt, energy[:, i], color=colour, ls=LINES[variant], lw=1.5)
         # The robot's number sits on its line, staggered so that neighbours do not cover each other.

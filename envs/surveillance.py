@@ -5,6 +5,7 @@ modules; this file packs specs and keys, steps all worlds at once and resets by 
 """
 
 import functools
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,6 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs import keys
+from envs.blocks import WorldBlock
 from envs.compilation import compiled
 from envs.config import SurveillanceConfig
 from envs.coverage import squared_distances, voronoi_moments, weighted_sum
@@ -37,11 +39,12 @@ class SurveillanceEnv(EnvBase):
         config: the world; a dataclass that has already validated itself.
         num_envs: number of worlds B, >= 1.
         device: where the state lives.
-        seed: seed of the environment's own random generator.
-        compile: run transition and violation counting through torch.compile; same results to rounding.
+        seed: seed of the environment's own random generator. Several seeds split the worlds into that many equal blocks with a
+            generator each (:mod:`envs.blocks`).
+        compile_functions: run transition and violation counting through torch.compile; same results to rounding.
 
     Raises:
-        ValueError: if ``num_envs < 1``.
+        ValueError: if ``num_envs < 1``, or no multiple of the number of seeds.
     """
 
     def __init__(
@@ -49,12 +52,15 @@ class SurveillanceEnv(EnvBase):
         config: SurveillanceConfig | None = None,
         num_envs: int = 1,
         device: torch.device | str | None = None,
-        seed: int | None = 0,
+        seed: int | Sequence[int] | None = 0,
         *,
-        compile: bool = False,  # the command line's word
+        compile_functions: bool = False,  # TorchRL takes the word compile for itself: all of a step, TensorDicts too
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
+        seeds = list(seed) if isinstance(seed, Sequence) else [seed]
+        if num_envs % len(seeds):
+            raise ValueError(f"num_envs={num_envs} is not a multiple of the number of seeds, {len(seeds)}.")
         config = config or SurveillanceConfig()
         device = torch.device(device or "cpu")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
@@ -65,20 +71,23 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
-        self._transition = compiled(functools.partial(transition, config=config), enabled=compile)
-        self._violations = compiled(functools.partial(violations, config=config), enabled=compile)
+        self._transition = compiled(functools.partial(transition, config=config), enabled=compile_functions)
+        self._violations = compiled(functools.partial(violations, config=config), enabled=compile_functions)
         self.reference_cost = self.density.reference_cost()
-        self.generator = torch.Generator(device=device)
+        self.n_blocks = len(seeds)
+        self.blocks = [WorldBlock(self, k, torch.Generator(device=device)) for k in range(len(seeds))]
         self._make_specs()
-        self._set_seed(seed)
+        for block, own in zip(self.blocks, seeds, strict=True):
+            if own is not None:
+                block.generator.manual_seed(own)
         self._continues = False
-        self._state = self._blank_state()
+        self.state = self._blank_state()
         self._write_start(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     # ---- TorchRL interface -----------------------------------------------------------------------------------------
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self.generator.manual_seed(seed)
+            self._only_block().generator.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -86,13 +95,13 @@ class SurveillanceEnv(EnvBase):
             mask = torch.full(self.batch_size, not self._continues, device=self.device)
             self._continues = False
         self._write_start(mask.reshape(self.batch_size))
-        out = self._outputs(*self._watch(self._state["position"], self._state["density"], advance=False))
+        out = self._outputs(*self._watch(self.state["position"], self.state["density"], advance=False))
         for kind in keys.VIOLATION_KINDS:
             out[(*keys.VIOLATION, kind)] = torch.zeros((*self._robots, 1), dtype=torch.bool, device=self.device)
         return self._with_flags(out, torch.zeros_like(mask).reshape(-1, 1), torch.zeros_like(mask).reshape(-1, 1))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        config, state = self.config, self._state
+        config, state = self.config, self.state
         position, energy = components_first(state["position"]), state["energy"]
         velocity = limit_speed(components_first(tensordict[keys.ACTION].to(position.dtype)), config.max_speed)
         if config.on_violation == "continue":
@@ -107,7 +116,7 @@ class SurveillanceEnv(EnvBase):
         slot = state["slot"]
         if config.reassign_slots:
             slot = reassign_slots(next_position, next_energy, slot, self.slots, self.geometry, self.bounds)
-        self._state = TensorDict(
+        self.state = TensorDict(
             {
                 "position": next_position,
                 "energy": next_energy,
@@ -124,13 +133,13 @@ class SurveillanceEnv(EnvBase):
         reward = -out[keys.COVERAGE_COST] / self.reference_cost
         out[keys.REWARD] = reward.unsqueeze(-1).expand(*self._robots, 1).clone()
         terminated = violated if config.on_violation == "terminate" else torch.zeros_like(violated)
-        step = self._state["step"]
+        step = self.state["step"]
         truncated = step >= config.horizon if config.horizon else torch.zeros_like(violated)
         return self._with_flags(out, terminated, truncated)
 
     def state_dict(self, *args, **kwargs) -> dict:
         """State of all worlds and of the random generator: restoring it continues the same random stream."""
-        return {"state": self._state.clone().to_dict(), "generator": self.generator.get_state()}
+        return self._only_block().state_dict()
 
     def load_state_dict(self, state_dict: dict, *args, **kwargs) -> None:
         """Restore what :meth:`state_dict` returned.
@@ -138,26 +147,20 @@ class SurveillanceEnv(EnvBase):
         Raises:
             ValueError: if the state belongs to another world or another number of worlds.
         """
-        given = TensorDict(state_dict["state"], [])
-        for name, value in self._state.items():
-            if name not in given or given[name].shape != value.shape:
-                raise ValueError(
-                    f"state {name!r} has shape {tuple(given[name].shape) if name in given else None}, this environment needs "
-                    f"{tuple(value.shape)}: the checkpoint is of another world or another collector.num_envs."
-                )
-        self._state = TensorDict(dict(given.items()), self.batch_size, device=self.device)
-        self.generator.set_state(state_dict["generator"].cpu())
+        self._only_block().load_state_dict(state_dict)
 
     def continue_from(self, state_dict: dict) -> None:
-        """:meth:`load_state_dict`, and the next reset of all worlds returns that state instead of drawing start states.
+        """As :meth:`envs.blocks.WorldBlock.continue_from`."""
+        self._only_block().continue_from(state_dict)
 
-        So a collector, which begins with a reset, goes on where another one was stopped.
-
-        Raises:
-            ValueError: as :meth:`load_state_dict`.
-        """
-        self.load_state_dict(state_dict)
+    def continue_at_reset(self) -> None:
+        """The next reset of all worlds returns their present state instead of drawing start states."""
         self._continues = True
+
+    def _only_block(self) -> WorldBlock:
+        if self.n_blocks > 1:
+            raise ValueError("this environment has several seeds: use its blocks.")
+        return self.blocks[0]
 
     def set_state(self, position: Tensor, energy: Tensor, slot: Tensor | None = None) -> TensorDictBase:
         """Place all robots by hand (tests, replays) and return the outputs of that state, as ``reset`` would.
@@ -170,10 +173,10 @@ class SurveillanceEnv(EnvBase):
         Returns:
             The environment's output keys at the new state.
         """
-        self._state["position"] = position.to(self.bounds).expand(*self._robots, -1).clone()
-        self._state["energy"] = energy.to(self.bounds).squeeze(-1).expand(self._robots).clone()
+        self.state["position"] = position.to(self.bounds).expand(*self._robots, -1).clone()
+        self.state["energy"] = energy.to(self.bounds).squeeze(-1).expand(self._robots).clone()
         if slot is not None:
-            self._state["slot"] = slot.to(self.device).squeeze(-1).expand(self._robots).clone()
+            self.state["slot"] = slot.to(self.device).squeeze(-1).expand(self._robots).clone()
         nobody = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return self._reset(TensorDict({"_reset": nobody}, self.batch_size))
 
@@ -195,16 +198,20 @@ class SurveillanceEnv(EnvBase):
     # ---- start states ----------------------------------------------------------------------------------------------
     def _write_start(self, mask: Tensor) -> None:
         """Draw certified start states for the worlds in ``mask`` ``(B,)``; the others keep theirs."""
-        index = mask.nonzero().squeeze(-1)
-        if index.numel() == 0:
-            return
-        batch = index.numel()
-        starts = draw_starts(batch, self.config, self.geometry, self.slots, self.bounds, self.generator)
-        drawn = dict(zip(("position", "energy", "slot"), starts, strict=True))
-        drawn["step"] = torch.zeros(batch, 1, dtype=torch.int64, device=self.device)
-        drawn["density"] = self.density.sample(batch, self.generator)
-        for name, value in drawn.items():
-            self._state[name] = self._state[name].index_copy(0, index, value)
+        for block in self.blocks:
+            index = block.draw_index(mask)
+            if not (batch := index.numel()):
+                continue
+            starts = draw_starts(batch, self.config, self.geometry, self.slots, self.bounds, block.generator)
+            drawn = dict(zip(("position", "energy", "slot"), starts, strict=True))
+            drawn["step"] = torch.zeros(batch, 1, dtype=torch.int64, device=self.device)
+            drawn["density"] = self.density.sample(batch, block.generator)
+            for name, value in drawn.items():
+                self.state[name] = self.state[name].index_copy(0, index, value)
+
+    def compile(self, **_: object) -> None:
+        """TorchRL's compilation of a whole step, by its keyword ``compile``, is refused: it would trace TensorDicts."""
+        raise TypeError("SurveillanceEnv(compile_functions=True) compiles what is worth it; compile= is TorchRL's.")
 
     def _blank_state(self) -> TensorDict:
         zeros = {"dtype": self.config.torch_dtype, "device": self.device}
@@ -229,11 +236,16 @@ class SurveillanceEnv(EnvBase):
     def _watch(self, position: Tensor, params: Tensor, *, advance: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """Density parameters, coverage cost ``(B, 1)`` and, if observed, centroids ``(B, N, d)`` of all worlds.
 
-        The Voronoi distances of a chunk of worlds at a time, so that their memory is bounded.
+        The Voronoi distances of a chunk of worlds at a time, so that their memory is bounded; never of several blocks, whose
+        sums then do not depend on each other's number.
         """
         density, parts = self.density, []
         size = max(1, CHUNK_DISTANCES // (position.shape[-2] * len(density.points)))
-        for robots, now in zip(position.split(size), params.split(size), strict=True):
+        chunks = zip(
+            *([c for block in x.chunk(self.n_blocks) for c in block.split(size)] for x in (position, params)),
+            strict=True,
+        )
+        for robots, now in chunks:
             squared = squared_distances(robots, density.points, clamp=False)
             nearest = squared.amin(dim=-2).clamp_min(0)
             after = density.advance(now, nearest) if advance else now
@@ -248,7 +260,7 @@ class SurveillanceEnv(EnvBase):
 
     def _outputs(self, params: Tensor, cost: Tensor, centroid: Tensor | None) -> TensorDict:
         """All keys that describe the present state, given what :meth:`_watch` returned of it."""
-        state = self._state
+        state = self.state
         out = {
             keys.OBSERVATION: self._observe(params, centroid),
             keys.POSITION: state["position"].clone(),
@@ -262,7 +274,7 @@ class SurveillanceEnv(EnvBase):
         return TensorDict(out, self.batch_size, device=self.device)
 
     def _observe(self, params: Tensor, centroid: Tensor | None) -> Tensor:
-        state = self._state
+        state = self.state
         seen, middle = self.density.observe(params), self.bounds.mean(-1)
         own = (state["position"], state["energy"], self.slots[state["slot"]], state["step"])
         return observe(*own, centroid, seen, self.stations, middle, self.config)

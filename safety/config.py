@@ -40,7 +40,7 @@ class SafetyConfig:
     both. half: each robot of a pair takes half of the row. full: all of it, the other taken as static. joint: one
     quadratic program over all robots."""
     sampled_data: bool = True
-    """Take the survivability row on the exact one-step map with rounding margins (SAFETY section 3) instead of the
+    """Take the survivability row on the exact one-step map with rounding margins (docs/safety.md, section 3) instead of the
     literature's continuous-time row, which lets a robot reach its charger a step too late. Needs composition=stacked."""
     alpha_c: float | None = None
     """Class-K gain of the survivability barrier, 1/s, (0, 1/dt]; null = 0.2/dt."""

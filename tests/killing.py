@@ -12,14 +12,16 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents import checkpoint
+from agents.recorder import TrainingRecorder
 
 RUN = (
     *("experiment=smoke", "env=moving_density", "env.horizon=20", "agent.n_steps=3", "agent.noise=ou", "device=cpu"),
     *("collector.num_envs=8", "collector.steps_per_batch=4", "collector.total_frames=1024", "buffer.capacity=500"),
     *("eval.interval_frames=256", "eval.num_envs=2", "eval.steps=5", "train.n_updates=2"),
-    *("checkpoint.interval_episodes=0", "checkpoint.interval_frames=96"),
+    *("checkpoint.interval_episodes=0", "checkpoint.interval_frames=96", "log.figures=false"),
 )
-"""A run of seconds with everything that has a state: moving density, OU noise, n-step returns, a buffer that overflows."""
+"""A run of seconds with everything that has a state: moving density, OU noise, n-step returns, a buffer that overflows. Of the
+pictures in its event file the animations are left, which take a tenth of the figures' time."""
 
 STAGES = (
     *("before", "half written", "before rename", "after rename", "after rows", "after checkpoint", "in set-aside"),
@@ -35,17 +37,25 @@ def context():
     return fork
 
 
-def start(folder: Path, arguments: tuple[str, ...], stage: str | None = None, count: int = 1, limit: int = 0):
+def start(
+    folder: Path,
+    arguments: tuple[str, ...],
+    stage: str | None = None,
+    count: int = 1,
+    limit: int = 0,
+    by: int = signal.SIGKILL,
+):
     """Start train.py in its own process, its output in ``<folder>.log``.
 
     Args:
         folder: the run's folder.
         arguments: overrides.
-        stage: one of :data:`STAGES`: the process kills itself there.
+        stage: one of :data:`STAGES`, or "in training" (a batch): the process sends itself a signal there.
         count: the how many-th time it gets there.
         limit: bytes that a file may have; 0 = no limit.
+        by: the signal.
     """
-    process = context().Process(target=_train, args=(str(folder), arguments, stage, count, limit))
+    process = context().Process(target=_train, args=(str(folder), arguments, stage, count, limit, by))
     process.start()
     return process
 
@@ -57,19 +67,21 @@ def run(folder: Path, arguments: tuple[str, ...] = RUN, **options) -> int:
     return process.exitcode
 
 
-def run_killed_after(folder: Path, seconds: float, arguments: tuple[str, ...] = RUN, by: int = signal.SIGKILL) -> int:
-    """Run train.py and send it a signal ``seconds`` after it began; its exit code."""
-    process = start(folder, arguments)
+def run_killed_after(folder: Path, seconds: float) -> int:
+    """Run train.py and kill it ``seconds`` after it began; its exit code."""
+    process = start(folder, RUN)
     end = time.monotonic() + seconds
     while process.is_alive() and time.monotonic() < end:
         time.sleep(0.005)
     if process.is_alive():
-        os.kill(process.pid, by)
+        os.kill(process.pid, signal.SIGKILL)
     process.join()
     return process.exitcode
 
 
-def _train(folder: str, arguments: tuple[str, ...], stage: str | None, count: int, limit: int) -> None:
+def _train(
+    folder: str, arguments: tuple[str, ...], stage: str | None, count: int, limit: int, by: int = signal.SIGKILL
+) -> None:
     import train
 
     torch.set_num_threads(1)
@@ -82,20 +94,20 @@ def _train(folder: str, arguments: tuple[str, ...], stage: str | None, count: in
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     if stage is not None:
-        _arm(stage, count)
+        _arm(stage, count, by)
     sys.argv = ["train.py", *arguments, f"hydra.run.dir={folder}"]
     train.main()
 
 
-def _arm(stage: str, count: int) -> None:
-    """Make the process kill itself when it gets to ``stage`` for the ``count``-th time."""
+def _arm(stage: str, count: int, by: int) -> None:
+    """Make the process send itself a signal when it gets to ``stage`` for the ``count``-th time."""
     left = count
 
     def die(condition: bool = True) -> None:
         nonlocal left
         left -= condition
-        if not left:
-            os.kill(os.getpid(), signal.SIGKILL)
+        if condition and not left:
+            os.kill(os.getpid(), by)
 
     save, replace = torch.save, Path.replace
 
@@ -128,6 +140,11 @@ def _arm(stage: str, count: int) -> None:
         die(stage == "in set-aside")
         return found
 
+    def patched_update(self, batch, update=TrainingRecorder.update):
+        die(stage == "in training")
+        update(self, batch)
+
+    TrainingRecorder.update = patched_update
     torch.save, Path.replace, Path.rename, Path.rmdir = patched_save, patched_replace, patched_rename, patched_rmdir
     if stage == "in event file":
         from tensorboard.summary.writer.record_writer import RecordWriter

@@ -107,10 +107,15 @@ def test_paths(tmp_path, n, d):
         assert (np.abs(image - to_rgb(COLOURS[i])).max(-1) < 0.02).sum() > 30
     figure = path_figure(world)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == [*(f"robot {i + 1}" for i in range(n)), "charging", "start", "end"]
+    general = ["charging", "start", "end", "charging station"] + ["charging range", "density φ"] * (d == 2)
+    assert labels == [*(f"robot {i + 1}" for i in range(n)), *general]
     (axes,) = figure.axes
-    paths = [c for c in axes.collections if len(c.get_segments()) == 39] if d == 2 else [None] * n
+    paths = [line for line in axes.lines if line.get_linestyle() != "None"]
     assert len(paths) == n
+    for i, line in enumerate(paths):
+        drawn = line.get_data() if d == 2 else line.get_data_3d()
+        np.testing.assert_array_equal(np.stack(drawn, axis=-1), world.position[:, i])
+    assert sorted(text.get_text() for text in axes.texts) == sorted(2 * [str(i + 1) for i in range(n)])
     if d == 2:
         thick = [c for c in axes.collections if c.get_linewidths()[0] > 4]
         gained = world.charging[1:].sum(axis=0)

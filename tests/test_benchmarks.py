@@ -4,6 +4,7 @@ import importlib
 from pathlib import Path
 
 import pytest
+import torch
 
 FOLDER = Path(__file__).parent / "benchmarks"
 TINY = ["--batches", "4", "--robots", "2", "--repeats", "1"]
@@ -27,11 +28,13 @@ def load(monkeypatch):
     ],
 )
 def test_program(load, capsys, name, arguments, titles):
-    load(name).main([*TINY, *arguments])
+    with torch.compiler.set_stance("force_eager"):  # test_compilation compiles
+        load(name).main([*TINY, *arguments])
     out = capsys.readouterr().out
     for title in titles:
         assert f"### {title}" in out
     assert "Traceback" not in out
+    assert "not offered by this version" not in out  # compiled rows
     rows = [line.split("|")[1:-1] for line in out.splitlines() if line.startswith("| ")]
     assert all(any(character.isdigit() for character in "".join(row[3:])) for row in rows if row[0].strip().isdigit())
 
@@ -89,3 +92,10 @@ def test_kill_study(load, capsys):
     out = capsys.readouterr().out
     assert "0 differences" in out
     assert "| killed | processes |" in out
+
+
+def test_many_seeds_against_single_runs(load, capsys):
+    load("bench_seeds").main(["--seeds", "2", "--threads", "1", "--frames", "512", "experiment=smoke", "device=cpu"])
+    rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith(("| 1", "| 2"))]
+    assert [row[0].strip() for row in rows] == ["1", "2"]
+    assert all(float(cell) > 0 for row in rows for cell in row)

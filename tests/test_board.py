@@ -8,28 +8,42 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.hparams.backend_context import Context as BackendContext
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 import train
 from agents.board import Board, plain
 from envs import keys
+from tests.conftest import call
+
+pytestmark = pytest.mark.xdist_group("board")  # its fixtures are made once, not by every worker
 
 
 def read(folder):
     return EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0, "histograms": 0}).Reload()
 
 
-@pytest.fixture
-def events(program, tmp_path):
-    code, output = program(
-        train.main, "experiment=smoke", "env.horizon=20", "hydra.run.dir=run", "agent.actor_lr=0.002"
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run's folder."""
+    folder = tmp_path_factory.mktemp("board") / "run"
+    assert (
+        call(train.main, "experiment=smoke", "env.horizon=20", f"hydra.run.dir={folder}", "agent.actor_lr=0.002") == 0
     )
-    assert code == 0, output
-    return read(tmp_path / "run")
+    return folder
 
 
-def test_a_run_answers_questions(events, tmp_path):
+@pytest.fixture(scope="module")
+def events(run):
+    return read(run)
+
+
+def test_a_run_answers_questions(events, run):
     scalars = set(events.Tags()["scalars"])
     assert {"train/return", "train/coverage_cost", "train/noise", "loss/q_value", "loss/grad_norm_actor"} <= scalars
     assert {f"train/violations_{kind}" for kind in keys.VIOLATION_KINDS} <= scalars
@@ -46,7 +60,7 @@ def test_a_run_answers_questions(events, tmp_path):
     last = {tag: events.Scalars(tag)[-1] for tag in scalars}
     assert last["filter/min_h_c"].value > 0
     assert last["filter/min_h_s"].value > 0
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary = json.loads((run / "summary.json").read_text())
     assert last["eval/coverage_cost"].step == summary["frames"]
     assert last["eval/coverage_cost"].value == pytest.approx(summary["eval"]["coverage_cost"])
     assert last["time/env_s"].value + last["time/filter_s"].value + last["time/inference_s"].value == pytest.approx(
@@ -70,18 +84,32 @@ def test_energies_and_pictures(events):
             assert getattr(picture, "n_frames", 1) == (20 if tag == "world/animation" else 1)
 
 
-def test_hyperparameters_stand_in_the_runs_own_file(events, tmp_path):
-    assert [path.name for path in (tmp_path / "run").iterdir() if path.is_dir()].count("checkpoints") == 1
-    assert not [path for path in (tmp_path / "run").iterdir() if path.is_dir() and path.name[0].isdigit()]
+def test_hyperparameters_stand_in_the_runs_own_file(events, run):
+    assert [path.name for path in run.iterdir() if path.is_dir()].count("checkpoints") == 1
+    assert not [path for path in run.iterdir() if path.is_dir() and path.name[0].isdigit()]
     content = events.PluginTagToContent("hparams")
     start = HParamsPluginData.FromString(content["_hparams_/session_start_info"]).session_start_info
     assert start.hparams["agent.actor_lr"].number_value == 0.002
     assert start.hparams["env.n_agents"].number_value == 3
     assert start.hparams["seed"].number_value == 0
-    experiment = HParamsPluginData.FromString(content["_hparams_/experiment"]).experiment
-    metrics = {info.name.tag for info in experiment.metric_infos}
-    assert "eval/coverage_cost" in metrics
-    assert metrics <= set(events.Tags()["scalars"]) | {"train/return"}
+    assert "_hparams_/experiment" not in content  # it would fix one run's columns, in alphabetical order, for all
+
+
+def test_settings_that_differ_come_first_in_the_table(tmp_path):
+    """As TensorBoard's own plugin answers the page."""
+    for k, rate in enumerate((0.1, 0.2, 0.1)):
+        board = Board(
+            tmp_path / str(k), 0, {"a": 1, "seed": k, "x": {"rate": rate}, "z": "y"}, figures=False, gif=False
+        )
+        board.scalars({"eval/coverage_cost": 0.3 + k, "train/return": -1.0}, 10)
+        board.close()
+    multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
+    provider = MultiplexerDataProvider(multiplexer, str(tmp_path))
+    request, backend = RequestContext(), BackendContext(TBContext(data_provider=provider, logdir=str(tmp_path)))
+    found = backend.experiment_from_metadata(request, "", True, backend.hparams_metadata(request, ""), None)
+    columns = [info.name for info in found.hparam_infos]
+    assert columns == ["seed", "x.rate", "a", "z"]
+    assert {info.name.tag for info in found.metric_infos} == {"eval/coverage_cost", "train/return"}
 
 
 def test_pictures_can_be_left_out(program, tmp_path):

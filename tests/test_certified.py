@@ -30,6 +30,8 @@ from tests.worlds import (
     roll_out,
 )
 
+pytestmark = pytest.mark.xdist_group("certified")  # its fixtures are made once, not by every worker
+
 torch.set_num_threads(1)
 WORLDS, DRAWN = draw_worlds(COUNT)
 EVERY_WORLD = pytest.mark.parametrize("index", range(COUNT), ids=lambda k: name(WORLDS[k][0]))

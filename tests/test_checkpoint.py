@@ -146,8 +146,10 @@ def test_set_aside_keeps_an_earlier_run_whole(tmp_path):
         (tmp_path / "checkpoints").mkdir()
         (tmp_path / "checkpoints" / f"frames_{k}.pt").write_bytes(b"x")
         (tmp_path / "summary.json").write_text(str(k))
+        (tmp_path / "events.out.tfevents.1.a").write_text(str(k))
         (tmp_path / ".hydra").mkdir(exist_ok=True)
         assert set_aside(tmp_path) == tmp_path / f"replaced_{k}"
         assert (tmp_path / f"replaced_{k}" / "summary.json").read_text() == str(k)
+        assert (tmp_path / f"replaced_{k}" / "events.out.replaced.1.a").read_text() == str(k)  # no run in TensorBoard
         assert (tmp_path / f"replaced_{k}" / "checkpoints" / f"frames_{k}.pt").exists()
         assert {path.name for path in tmp_path.iterdir() if not path.name.startswith("replaced")} == {".hydra"}

@@ -11,13 +11,19 @@ from tensordict.nn import TensorDictSequential
 import envs.compilation
 from agents import make_controller
 from envs import SurveillanceConfig, SurveillanceEnv, keys
-from envs.compilation import compiled
+from envs.compilation import Compiled, compiled
 from safety import SafetyConfig, SafetyFilter
 
+pytestmark = pytest.mark.xdist_group("compilation")  # the compiler starts once
 
-def roll_out(world, steps=15, **options):
-    env = SurveillanceEnv(world, 24, seed=3, **options)
-    policy = TensorDictSequential(make_controller("gather", world), SafetyFilter(SafetyConfig(), world, **options))
+
+def roll_out(world, steps=15, compile=False):
+    env = SurveillanceEnv(world, 24, seed=3, compile_functions=compile)
+    assert isinstance(env._transition, Compiled) == isinstance(env._violations, Compiled) == compile
+    assert "_compiled_step_and_maybe_reset" not in vars(env)  # TorchRL's own way: TensorDicts through Dynamo
+    policy = TensorDictSequential(
+        make_controller("gather", world), SafetyFilter(SafetyConfig(), world, compile=compile)
+    )
     return env.rollout(steps, policy, break_when_any_done=False)
 
 
@@ -37,7 +43,7 @@ def test_compiled_roll_out_is_the_same_to_rounding(world):
 
 
 def test_violations_are_counted_when_compiled(world):
-    env = SurveillanceEnv(world, 24, compile=True)
+    env = SurveillanceEnv(world, 24, compile_functions=True)
     td, seen = env.reset(), 0
     for _ in range(40):  # everybody to one point, unfiltered
         td[keys.ACTION] = -0.2 * torch.nn.functional.normalize(td[keys.POSITION], dim=-1)
@@ -66,6 +72,11 @@ def test_without_a_compiler_a_warning_and_the_same_results(world, monkeypatch):
 def test_a_compiled_function_survives_a_copy():
     function = pickle.loads(pickle.dumps(compiled(torch.sin, enabled=True)))
     torch.testing.assert_close(copy.deepcopy(function)(torch.ones(3)), torch.ones(3).sin())
+
+
+def test_torchrls_own_compilation_is_refused(world):
+    with pytest.raises(TypeError, match="compile_functions=True"):
+        SurveillanceEnv(world, 2, compile=True)
 
 
 def test_off_means_untouched():

@@ -5,14 +5,20 @@
 
 import os
 import random
+import re
 import sys
 from pathlib import Path
 
 import pytest
 from hydra.errors import HydraException
 
+import evaluate
+import report
 import train
+from agents.controllers import CONTROLLERS
+from conf.evaluate_schema import EvaluateConfig
 from conf.manual import defaults, documentation, explain
+from conf.report_schema import ReportConfig
 from conf.schema import Config
 
 COUNT = int(os.environ.get("FUZZ_CASES", "160"))
@@ -104,11 +110,11 @@ def number(draw):
     return draw.choice((near, near, near, -near, near * draw.choice((1e-3, 10, 1e6)), round(near)))
 
 
-def one(draw, names):
+def one(draw, names, schema=Config, groups=GROUPS):
     """One override: of a known option, a group, or something that is no override at all."""
     kind = draw.random()
-    if kind < 0.12:
-        group = draw.choice(GROUPS)
+    if kind < 0.12 and groups:
+        group = draw.choice(groups)
         return f"{group}={draw.choice([*options(group), *options(group), draw.choice(STRANGE)])}"
     if kind < 0.2:
         name = draw.choice([*names, "x", "env.x", "hydra.x", "agent"])
@@ -116,14 +122,14 @@ def one(draw, names):
     if kind < 0.24:
         return draw.choice(STRANGE) + draw.choice(STRANGE)
     name = draw.choice(names)
-    start = defaults(Config)[name]
+    start = defaults(schema)[name]
     if kind < 0.4:
         value = draw.choice(STRANGE)
     elif isinstance(start, bool):
         value = draw.choice(("true", "false"))
     elif isinstance(start, str):
         words = (
-            documentation(Config)[name].replace(":", " ").replace("|", " ").replace(",", " ").replace(".", " ").split()
+            documentation(schema)[name].replace(":", " ").replace("|", " ").replace(",", " ").replace(".", " ").split()
         )
         value = draw.choice([start, start, *words[:6]])
     else:
@@ -144,6 +150,15 @@ def draws(chunk):
 ACCEPTED = 77
 
 
+def check_refusal(code, output, told):
+    """One clear message."""
+    assert code == 1, told
+    lines = output.strip().splitlines()
+    assert 1 <= len(lines) <= 8, told
+    assert lines[0].startswith("error: "), told
+    assert all(len(line) <= 130 for line in lines), told
+
+
 @pytest.mark.parametrize("chunk", range(CHUNKS))
 def test_random_overrides(program, tmp_path, monkeypatch, chunk, record_property):
     def stop(*_):
@@ -158,11 +173,7 @@ def test_random_overrides(program, tmp_path, monkeypatch, chunk, record_property
         if code == ACCEPTED:
             accepted += 1
             continue
-        assert code == 1, told
-        lines = output.strip().splitlines()
-        assert 1 <= len(lines) <= 8, told
-        assert lines[0].startswith("error: "), told
-        assert all(len(line) <= 130 for line in lines), told
+        check_refusal(code, output, told)
     folders = [path for path in tmp_path.rglob("*") if path.is_dir() and path.name == ".hydra"]
     assert len(folders) <= accepted  # of accepted runs only
     record_property("accepted", accepted)
@@ -204,16 +215,30 @@ def test_every_option_is_documented():
     assert not [name for name, words in text.items() if len(words) < 10]
 
 
-def test_help_is_a_manual(program):
-    code, output = program(train.main, "--help")
+@pytest.mark.parametrize(
+    ("main", "schema", "groups"),
+    [
+        (train.main, Config, GROUPS),
+        (evaluate.main, EvaluateConfig, ("env", "safety")),
+        (report.main, ReportConfig, ()),
+    ],
+)
+def test_help_is_a_manual(program, main, schema, groups):
+    code, output = program(main, "--help")
     assert code == 0
-    for name in defaults(Config):
+    for name in defaults(schema):
         assert f"  {name}=" in output
     for group in GROUPS:
-        for option in options(group):
-            assert option in output
+        line = output.split(f"\n  {group}: ")[1:2]
+        assert bool(line) == (group in groups)
+        assert all(option in "".join(line) for option in (options(group) if line else ()))
     assert "$" not in output
-    assert max(map(len, output.splitlines())) < 200
+    assert max(map(len, output.splitlines())) <= 132
+
+
+def test_every_controller_is_in_the_manual():
+    text = documentation(EvaluateConfig)["controller"]
+    assert set(CONTROLLERS) == set(re.sub("[a-zA-Z]+:|[|.]", " ", text).split())
 
 
 @pytest.mark.parametrize(
@@ -225,6 +250,8 @@ def test_help_is_a_manual(program):
         ("collector=5", "collector is a group; its options: collector.num_envs"),
         ("+agent.x=1", "There is no option 'agent.x'"),
         ("~seed", "~seed: options cannot be deleted"),
+        ("~agent", "~agent: groups cannot be deleted; choose a file of it with agent=<name>."),
+        ("~env=default", "~env=default: groups cannot be deleted"),
         ("a", "'a' is not an override"),
         ("env=[1]", "Hydra cannot combine these overrides"),
         ("--x=1", "'--x=1' is neither a flag nor an override"),

@@ -157,7 +157,7 @@ def test_lemma_6_the_best_assignment_of_separated_robots_is_certified():
 def test_distance_between_samples_keeps_the_chord_bound(index):
     """Corollary 2: sqrt(Delta_G^2 - U^2), up to a rounding margin."""
     world, gains = draw_worlds(COUNT)[0][index]
-    record = roll_out(world, gains, seed=index)
+    record = roll_out(world, gains, seed=index, keep_rows=False)
     g, step = world.homing, world.max_speed * world.dt
     before, after = (record.data[key].double() for key in ("position", "next_position"))
     i, j = torch.triu_indices(world.n_agents, world.n_agents, 1)
@@ -185,7 +185,7 @@ def test_docked_robots_on_a_wall_stay_in_the_set(dtype):
 def test_single_precision_does_not_erode_the_set(reserve):
     """Theorem 3: robots driven into each other and to the end of their reserve for a long time never leave C_0."""
     world = SurveillanceConfig(resolution=2, density="uniform", horizon=0, reserve=reserve, drain_rate=0.02)
-    record = roll_out(world, {}, worlds=12, steps=600, seed=1, kinds=("away", "chase", "descent"))
+    record = roll_out(world, {}, worlds=12, steps=600, seed=1, kinds=("away", "chase", "descent"), keep_rows=False)
     assert not record.data["outside"].any()
     assert record.data["h_g"].min() >= -world.homing.eps_distance
     assert record.data["h_g"].min() < 10 * world.homing.eps_distance

@@ -16,7 +16,7 @@ from agents.checkpoint import CheckpointError, load_checkpoint
 from agents.learned import SHIPPED, actor_layers, export_actor
 from agents.networks import make_actor
 from agents.pipeline import STORED, to_transitions
-from conf.schema import TrainConfig
+from agents.training_config import TrainConfig
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -176,7 +176,7 @@ def test_another_world_gives_one_clear_error_and_no_folder(program, tmp_path, fi
 
 def test_train_one_and_evaluate_it(program, tmp_path):
     tiny = ("env=five_robots", "env.horizon=6", "device=cpu")
-    short = ("experiment=smoke", "collector.total_frames=256", *tiny)
+    short = ("experiment=smoke", "collector.total_frames=256", "log.figures=false", "log.gif=false", *tiny)
     code, output = program(train.main, *short, "train.objective=adversary", "agent.actor_cells=[8]", "hydra.run.dir=a")
     assert code == 0, output
     code, output = program(train.main, *short, "hydra.run.dir=b")

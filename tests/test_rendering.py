@@ -14,12 +14,12 @@ from envs.rendering import (
     draw_world,
     moving_mean,
     save_battery_plot,
-    save_gif,
     save_snapshots,
     save_training_curve,
     survey_charge_survey,
     voronoi_cells,
 )
+from envs.video import save_gif
 
 ARRIVE, START, STOP, LEAVE = 12, 14, 26, 27  # robot 0 is in range in [ARRIVE, LEAVE), gains in [START, STOP)
 

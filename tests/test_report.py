@@ -1,21 +1,19 @@
 """report.py on synthetic run folders against hand computation, and once on real runs."""
 
-import csv
-import dataclasses
 import json
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 import evaluate
 import report
 import train
-from agents.report_runs import ReportError, Run, check_runs, find_runs, read_curves
+from agents.report_runs import ReportError, Run, check_runs, find_runs, read_events
 from agents.report_statistics import (
     ALL,
     BOUND,
@@ -28,63 +26,9 @@ from agents.report_statistics import (
     ratio,
 )
 from agents.report_tables import find_method, number
-from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig
 from envs.centroidal import centroidal_cost
-
-KINDS = ("depleted", "stranded", "overcharged", "collision")
-FILTER = {"intervention_rate": 0.5, "fallback_rate": 0.03, "homing_rate": 0.01, "infeasible": 2, "outside": 1}
-METRICS = {"episode_reward": -20.0, "charges_per_robot": 1.5, "robot_steps": 60}
-
-
-def write_run(
-    sweep,
-    seed,
-    cost,
-    *overrides,
-    world="default",
-    method=None,
-    controller=None,
-    experiment="default",
-    name=None,
-    **changes,
-):
-    """A run's folder with known numbers; ``cost=None`` leaves it unfinished."""
-    overrides = [f"seed={seed}", *overrides]
-    folder = sweep / (name or f"{world}_{method or controller or '_'.join(overrides[1:])}_{seed}")
-    (folder / ".hydra").mkdir(parents=True)
-    choices = {"env": world, "safety": "certified"} | ({"method": method} if method else {})
-    config = {"seed": seed, "env": {"n_agents": 3, "horizon": 20, "on_violation": "terminate"} | changes.get("env", {})}
-    if controller:
-        config |= {"run": None, "controller": controller, "steps": changes.get("steps", 20), "restart": False}
-    else:
-        config |= {"collector": {"total_frames": 100}, "eval": {"steps": changes.get("steps", 0)}}
-        choices["experiment"] = experiment
-    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-    hydra = {"hydra": {"runtime": {"choices": choices}, "overrides": {"task": overrides}}}
-    OmegaConf.save(hydra, folder / ".hydra" / "hydra.yaml")
-    if cost is None:
-        return folder
-    git_hash = changes.get("git_hash", "abc")
-    violations = changes.get("violations", {})
-    test = METRICS | {"coverage_cost": cost, "violations": dict.fromkeys(KINDS, 0) | violations}
-    if controller:
-        origin = {"git_hash": git_hash, "wall_time_s": 1.0, "steps": 20, "policy": controller, "env": config["env"]}
-        (folder / "eval.json").write_text(json.dumps(test | {"filter": FILTER, "task": {"waypoints": 7}} | origin))
-        return folder
-    content = {"config_hash": changes.get("config_hash", "c0ffee00"), "git_hash": git_hash, "seed": seed, "eval": test}
-    content |= {"frames": changes.get("frames", 100), "episodes": 5, "wall_time_s": 9.0, "frames_per_second": 11.0}
-    content |= {"train": {"violations": dict.fromkeys(KINDS, seed)}, "filter": FILTER}
-    (folder / "summary.json").write_text(json.dumps(content))
-    if changes.get("events", True):
-        writer, start = SummaryWriter(str(folder)), time.time()
-        for k in range(4):
-            point = {"global_step": 32 * k, "walltime": start + 10 * k}
-            writer.add_scalar("eval/coverage_cost", cost + 3 - k, **point)
-            for tag, value in FILTER.items():
-                writer.add_scalar(f"filter/{tag}", value + 0.01 * seed, **point)
-        writer.close()
-    return folder
+from tests.synthetic_runs import read, write_run
 
 
 @pytest.fixture
@@ -97,17 +41,18 @@ def sweep(tmp_path):
     return tmp_path / "sweep"
 
 
-def read(path):
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def table(folder):
     return {(r["world"], r["method"], r["quantity"], r["against"]): r for r in read(folder / "report" / "table.csv")}
 
 
 def messages(output):
     return " ".join(output.split())
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Drawing takes most of a report's time; for reports of which only numbers and texts are looked at."""
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
 
 
 # ---- statistics
@@ -231,6 +176,7 @@ def test_numbers_by_hand(program, sweep):
     assert "coverage_cbf + certified" in (sweep / "report" / "curves.svg").read_text()  # the reference's line
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_csv_files_read_back(program, sweep):
     code, output = program(report.main, "sweep=sweep", "resamples=100")
     assert code == 0, output
@@ -270,7 +216,7 @@ def test_one_seed_has_no_interval(program, tmp_path):
     assert all(row["low"] == "" for row in read(tmp_path / "sweep/report/curves.csv"))
 
 
-def test_several_worlds(program, tmp_path):
+def test_several_worlds(program, tmp_path, monkeypatch):
     sweep, cbf = tmp_path / "sweep", "coverage_cbf + certified"
     for seed in range(2):
         for world, cost in (("default", 2.0), ("aerial", 20.0)):
@@ -292,12 +238,14 @@ def test_several_worlds(program, tmp_path):
     assert "left out: only_here" in text
 
     write_run(sweep, 0, 5.0, "env.n_agents=5", method="maddpg", name="larger")  # another world, without the reference
+    monkeypatch.setattr(report, "save_figures", lambda *_: [])
     code, output = program(report.main, "sweep=sweep", "resamples=300")
     assert code == 0, output
     assert float(table(sweep)["default n_agents=5", "maddpg", "coverage_cost.iqm", ""]["value"]) == 5.0
     assert f"The reference {cbf} does not have runs in every world" in (sweep / "report/report.md").read_text()
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_what_lies_in_a_run_is_no_run(program, sweep):
     run = sweep / "deep" / "default_agent=ddpg_0"
     write_run(run / "replaced_1", 0, 77.0, "agent=ddpg", name=".")
@@ -400,6 +348,7 @@ def test_errors_of_the_command_line(program, tmp_path, sweep, arguments, expecte
     assert set(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_incomplete_reports_what_there_is_and_says_so(program, sweep):
     write_run(sweep, 8, None, "agent=ddpg", name="killed")
     write_run(sweep, 0, 1.0, "agent=new")
@@ -493,7 +442,7 @@ def test_labels(tmp_path, overrides, kind, world, method):
 
 
 def fake(method, seed=0, world="default", learned=True):
-    folder = report.Path(f"{method}{seed}")
+    folder = Path(f"{method}{seed}")
     return Run(folder, method, world, method, seed, learned, "hash", {}, "", 3, finished=True)
 
 
@@ -559,8 +508,10 @@ def test_frames_logged_twice_count_once(tmp_path):
         time.sleep(
             0 if values[0] == 3.0 else 1.1
         )  # event files are read in the order of their names, which hold seconds
-    (run,) = runs_of(tmp_path)
-    curve = read_curves(run)["eval/coverage_cost"]
+    events = read_events(folder, ["eval/coverage_cost", "not/logged"])
+    assert set(events.points) == {"eval/coverage_cost"}
+    curve = events.curves()["eval/coverage_cost"]
+    assert 1 <= curve[1, 1] < 60  # of the second file, in seconds since the first event
     assert curve[:, 0].tolist() == [10, 11, 12]
     assert curve[:, 2].tolist() == [1.0, 3.0, 4.0]
 
@@ -568,21 +519,14 @@ def test_frames_logged_twice_count_once(tmp_path):
 # ---- the program
 
 
-def test_help_explains_every_field(program):
-    code, output = program(report.main, "--help")
-    assert code == 0
-    manual = output.split("Examples:")[0]
-    assert all(field.name in manual for field in dataclasses.fields(ReportConfig))
-
-
-def test_a_real_sweep(program, tmp_path):
+def test_a_real_sweep(program, tmp_path, monkeypatch):
     tiny = ("experiment=smoke", "collector.total_frames=256", "eval.interval_frames=128", "device=cpu")
     code, output = program(train.main, "-m", *tiny, "seed=0,1")
     assert code == 0, output
     controller = ("controller=coverage_cbf", "seed=0,1", "steps=20", "num_envs=4", "pictures=false", "device=cpu")
     code, output = program(evaluate.main, "-m", *controller)
     assert code == 0, output
-    code, output = program(report.main, "sweep=runs", "resamples=200")
+    code, output = program(report.main, "sweep=runs", "resamples=200", "pack=kept/runs.tar.xz")
     assert code == 0, output
     assert "warning" not in output
     summaries = [json.loads(path.read_text()) for path in sorted(tmp_path.glob("runs/smoke/*/summary.json"))]
@@ -599,3 +543,19 @@ def test_a_real_sweep(program, tmp_path):
     assert float([row for row in curves if row["quantity"] == "coverage_cost"][-1]["value"]) == pytest.approx(
         np.mean(costs)
     )
+
+    # the same on another machine: nothing is done twice, and the report has the same bytes
+    monkeypatch.chdir(tmp_path / "kept")
+    code, output = program(report.main, "sweep=runs", "unpack=runs.tar.xz")
+    assert code == 0, output
+    assert "4 runs of runs.tar.xz unpacked, 0 were there" in messages(output)
+    before = {path: path.stat().st_mtime for path in Path("runs").rglob("*.json")}
+    code, output = program(train.main, "-m", *tiny, "seed=0,1")
+    assert (code, output.count("holds a finished run: nothing to do")) == (0, 2), output
+    code, output = program(evaluate.main, "-m", *controller, "resume=auto")
+    assert (code, output.count("eval.json exists: nothing to do")) == (0, 2), output
+    assert {path: path.stat().st_mtime for path in Path("runs").rglob("*.json")} == before
+    code, output = program(report.main, "sweep=runs", "resamples=200")
+    assert code == 0, output
+    for name in ("report.md", "table.csv", "runs.csv", "curves.csv"):
+        assert Path("runs/report", name).read_bytes() == (tmp_path / "runs/report" / name).read_bytes()

@@ -18,13 +18,17 @@ from agents.training_state import check_origin
 from tests import killing
 from tests.killing import RUN, differences, result, run, run_killed_after
 
+pytestmark = pytest.mark.xdist_group("resume")  # its fixtures are made once, not by every worker
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """Result of a run that nothing happens to."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     assert run(folder) == 0, said(folder)
-    return result(folder)
+    found = result(folder)
+    assert {"eval/coverage_cost", "train/energy", "world/animation"} <= set(found["curves"])
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -80,17 +84,11 @@ def test_killed_while_an_earlier_run_is_moved_aside(tmp_path, whole):
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_writes_a_checkpoint_and_ends_the_run(tmp_path, whole, signum):
-    folder, code, wait = tmp_path / "run", 0, 0.3
-    arguments = (*RUN, "checkpoint.interval_frames=0")
-    while not (folder / "checkpoints").exists() or code < 0:  # before the first batch it ends at once
-        shutil.rmtree(folder, ignore_errors=True)
-        Path(f"{folder}.log").unlink(missing_ok=True)
-        code, wait = run_killed_after(folder, wait, arguments, by=signum), wait + 0.2
-        assert not (folder / "summary.json").exists(), "the run was over before the signal"
-        if not checkpoints(folder / "checkpoints"):
-            code = -1
-    assert code == 128 + signum
+    folder, arguments = tmp_path / "run", (*RUN, "checkpoint.interval_frames=0")
+    assert run(folder, arguments, stage="in training", count=9, by=signum) == 128 + signum
+    assert not (folder / "summary.json").exists()
     frames = load_checkpoint(checkpoints(folder / "checkpoints")[-1])["frames"]
+    assert frames == 9 * 32
     assert f"stopped by {signal.Signals(signum).name} at {frames} frames" in said(folder)
     assert "Traceback" not in said(folder)
     assert run(folder, arguments) == 0

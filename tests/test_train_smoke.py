@@ -15,7 +15,9 @@ TINY = (
     *("collector.num_envs=4", "collector.steps_per_batch=2", "collector.total_frames=64", "buffer.batch_size=8"),
     *("buffer.capacity=64", "train.warmup_frames=16", "train.n_updates=1", "eval.num_envs=2", "eval.steps=5"),
     *("eval.interval_frames=32", "checkpoint.interval_episodes=1", "env.horizon=6", "device=cpu"),
+    *("log.figures=false", "log.gif=false"),
 )
+PICTURES = ("log.figures=true", "log.gif=true", "eval.interval_frames=0")  # where the world decides how they look
 VARIANTS = {
     **{experiment: (f"experiment={experiment}",) for experiment in ("default", "smoke", "paper", "paper_literal")},
     "literal filter": ("safety=paper",),
@@ -33,13 +35,13 @@ VARIANTS = {
     "violation penalty": ("safety=none", "train.violation_penalty=1.0", "env.on_violation=continue"),
     "adversary": ("experiment=adversary",),
     "adversary of one robot behind the literal filter": ("train.objective=adversary", "safety=paper", "env.n_agents=1"),
-    "aerial": ("env=aerial",),
-    "five robots, float64": ("env=five_robots", "env.dtype=float64"),
+    "aerial": ("env=aerial", *PICTURES),
+    "five robots, float64": ("env=five_robots", "env.dtype=float64", *PICTURES),
     "density per world": ("env=random_density",),
-    "moving density": ("env=moving_density",),
-    "age density": ("env=age_density",),
-    "long duration": ("env=long_duration", "env.horizon=0"),
-    "one robot": ("env.n_agents=1",),
+    "moving density": ("env=moving_density", *PICTURES),
+    "age density": ("env=age_density", *PICTURES),
+    "long duration": ("env=long_duration", "env.horizon=0", *PICTURES),
+    "one robot": ("env.n_agents=1", *PICTURES),
 }
 
 
@@ -128,17 +130,18 @@ def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
 
 def test_same_seed_same_result(program, tmp_path):
     results = []
+    short = ("experiment=smoke", "collector.total_frames=256", "log.figures=false", "log.gif=false")
     for name in ("a", "b"):
-        code, output = program(train.main, "experiment=smoke", "collector.total_frames=256", f"hydra.run.dir={name}")
+        code, output = program(train.main, *short, f"hydra.run.dir={name}")
         assert code == 0, output
         summary = json.loads((tmp_path / name / "summary.json").read_text())
         results.append((summary["eval"], summary["filter"], summary["train"]))
     assert results[0] == results[1]
-    again = ("experiment=smoke", "collector.total_frames=256", "hydra.run.dir=a", "resume=never")
+    again = (*short, "hydra.run.dir=a", "resume=never")
     code, _ = program(train.main, *again)
     assert json.loads((tmp_path / "a" / "summary.json").read_text())["eval"] == results[0][0]
     assert (tmp_path / "a" / "replaced_1" / "summary.json").exists()
-    code, _ = program(train.main, "experiment=smoke", "collector.total_frames=256", "hydra.run.dir=c", "seed=1")
+    code, _ = program(train.main, *short, "hydra.run.dir=c", "seed=1")
     other = json.loads((tmp_path / "c" / "summary.json").read_text())
     assert other["eval"] != results[0][0]
 

@@ -264,8 +264,8 @@ class Record:
     """Which robots the filter solved a program for, in every step (certified only)."""
 
 
-def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, **safety_fields):
-    """Run the filter in the world against the adversary, from edge states."""
+def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, keep_rows=True, **safety_fields):
+    """Run the filter in the world against the adversary, from edge states; ``keep_rows``: with the rows of every robot."""
     env = SurveillanceEnv(world, worlds, seed=seed)
     safety_filter = SafetyFilter(SafetyConfig(**{**gains, **safety_fields}), world)
     position, energy, slot = edge_states(env, seed)
@@ -279,7 +279,7 @@ def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, **safety
         pressed.append(rows_given.robots)
         return rows_given
 
-    with mock.patch("safety.filter.certified_rows", keep):
+    with mock.patch("safety.filter.certified_rows", keep if keep_rows else build):
         for _ in range(steps):
             td = td.select(*STATE)
             td[keys.NOMINAL_ACTION] = adversary(td[keys.POSITION], env.slots[td[keys.SLOT].squeeze(-1)])

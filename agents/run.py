@@ -1,0 +1,288 @@
+"""The run of one seed: its replay buffer, counters, curves and checkpoints; several of them share collector and updates."""
+
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+
+from agents.board import Board
+from agents.checkpoint import CheckpointError, world_sizes
+from agents.divergence import DivergedError, check_batch, check_finite, check_weights
+from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
+from agents.incident import ViolationError, check_violations
+from agents.learners import Learner
+from agents.networks import ExplorationNoise
+from agents.pipeline import WaitingSteps, make_buffer
+from agents.recorder import Every, Seconds, TrainingRecorder
+from agents.training_config import Config
+from agents.training_state import TrainingState
+from envs import SurveillanceEnv, keys
+from envs.blocks import WorldBlock
+from envs.rendering import save_training_curve
+
+FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
+"""What ends one seed's run and not the others' of its program."""
+
+
+class SeedsFailedError(RuntimeError):
+    """Some seeds of a program failed; the message names them, the others are complete."""
+
+
+def seeds_of_streams(seed: int) -> list[int]:
+    """Seeds of a run's own random streams: worlds, noise, replay sampling, evaluation."""
+    return np.random.SeedSequence(seed).generate_state(4).tolist()
+
+
+class TrainingRun:
+    """One seed's run in its folder.
+
+    Args:
+        folder: where it writes.
+        config: the configuration; the seed is this run's.
+        seed: its seed.
+        origin: where it comes from, for summary and checkpoints, "config" and "world" aside.
+        settings: the hashed configuration, nested.
+        learner: its networks and optimisers.
+        worlds: its worlds.
+        waiting: its steps that wait for n-step transitions.
+        noise: its exploration noise.
+        policy: deployment policy of its networks.
+        eval_env: the worlds of evaluations, shared by all runs.
+        seconds: where the program's time goes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: Config,
+        seed: int,
+        origin: dict,
+        settings: dict,
+        *,
+        learner: Learner,
+        worlds: WorldBlock,
+        waiting: WaitingSteps,
+        noise: ExplorationNoise,
+        policy: TensorDictSequential,
+        eval_env: SurveillanceEnv,
+        seconds: Seconds,
+    ) -> None:
+        self.folder, self.config, self.seed, self.origin, self.settings = folder, config, seed, origin, settings
+        self.learner, self.noise, self.policy, self.eval_env = learner, noise, policy, eval_env
+        self.error: Exception | None = None
+        """What ended the run before its time, where it shares its program with others."""
+        _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
+        device, agent = eval_env.device, config.agent
+        minibatches = config.env.n_agents if agent.minibatch == "per_agent" else 1
+        self.buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
+        self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
+        self.clocks = {
+            "log": Every(max(1, config.collector.total_frames // config.log.points)),
+            "evaluate": Every(config.eval.interval_frames),
+            "save_frames": Every(config.checkpoint.interval_frames),
+            "save_episodes": Every(config.checkpoint.interval_episodes),
+        }
+        parts = {"actor": learner.actor, "loss": learner.loss, "optimizers": learner.optimizers, "env": worlds}
+        parts |= {"noise": noise, "multi_step": waiting, "recorder": self.recorder, "clocks": self.clocks}
+        parts |= {"seconds": seconds}
+        made_for = {"config": settings, "world": world_sizes(eval_env)}
+        keep, with_buffer = config.checkpoint.keep, config.checkpoint.buffer
+        self.state = TrainingState(folder, parts, self.buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
+        self.check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
+        self.learns_from = config.train.warmup_frames
+        self.progress = ""
+        """What the progress bar shows."""
+
+    def begin(self, tell: Callable[[str], None], latest: int | None = None) -> None:
+        """Go on from a checkpoint if there is one (see :meth:`TrainingState.resume`), and open the curves."""
+        kept_rows = self.state.resume(self.config.resume, tell, latest)
+        self.learns_from += 0 if kept_rows else self.recorder.frames
+        log, settings = self.config.log, self.settings | {"seed": self.seed}
+        self.board = Board(self.folder, self.recorder.frames, settings, figures=log.figures, gif=log.gif)
+
+    def evaluate(self) -> None:
+        """Measure the deployment policy, from the same start states every time."""
+        self.eval_env.set_seed(self.eval_seed)
+        steps = self.config.eval.steps or rollout_steps(self.config.env.horizon)
+        metrics, statistics, trajectory = evaluate_policy(
+            self.eval_env, self.policy, steps, record=self.board.records, check=self.check
+        )
+        self.board.scalars(evaluation_scalars(metrics), self.recorder.frames)
+        self.board.world(trajectory, self.recorder.frames)
+        if self.recorder.evaluated(metrics | {"filter": statistics}):
+            self.state.save_best()
+
+    def take(self, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
+        """Count a collected batch, check it and store its transitions.
+
+        Args:
+            batch: ``(num_envs, T)``.
+            steps: ``(M,)``, what :class:`agents.pipeline.MultiStep` made of it.
+            rewards: ``(num_envs, T, N, 1)``, those of the objective.
+
+        Raises:
+            DivergedError: if an observation, action or reward is not finite.
+            ViolationError: at a violation behind the certified filter.
+        """
+        self.recorder.update(batch)
+        self.check(batch)
+        check_batch(batch, self.recorder.frames)
+        if len(steps):
+            self.buffer.extend(steps)
+        self.batch, self.rewards = batch, rewards
+
+    @property
+    def learns(self) -> bool:
+        """Whether warm-up is over (and the run has not failed)."""
+        return self.error is None and self.recorder.frames >= self.learns_from and len(self.buffer) > 0
+
+    def log(self, losses: dict[str, Tensor], seconds: Seconds, k: int) -> None:
+        """Add a point to the curves if one is due.
+
+        Args:
+            losses: of :func:`agents.maddpg.update_step`.
+            seconds: where the program's time went.
+            k: which of several learners this one is.
+
+        Raises:
+            DivergedError: if a loss is not finite.
+        """
+        frames = self.recorder.frames
+        if not self.clocks["log"](frames):
+            return
+        scalars = self.recorder.scalars() | {"train/noise": self.noise.sigma}
+        scalars["train/reward"] = float(self.rewards.mean())  # the objective's
+        numbers = {name: float(value[k] if value.dim() else value) for name, value in losses.items()}
+        check_finite(numbers, frames)
+        scalars |= {f"loss/{name}": value for name, value in numbers.items()}
+        self.board.scalars(scalars | seconds.scalars(frames), frames)
+        if self.config.log.histograms:
+            self.board.histogram("train/energy", self.batch["next"][keys.ENERGY], frames)
+        self.progress = self.recorder.progress(scalars)
+
+    @property
+    def ends(self) -> bool:
+        """Whether the last frame is collected."""
+        return self.recorder.frames == self.config.collector.total_frames
+
+    def evaluate_when_due(self) -> None:
+        """Evaluate at the interval of ``eval``, and at the end."""
+        if self.clocks["evaluate"](self.recorder.frames) | self.ends:
+            self.evaluate()
+
+    @property
+    def saves(self) -> bool:
+        """Whether a checkpoint is due; asking starts the next interval."""
+        frames, episodes = self.recorder.frames, self.recorder.episodes.episodes
+        return self.clocks["save_frames"](frames) | self.clocks["save_episodes"](episodes) | self.ends
+
+    def save(self) -> None:
+        """Write a checkpoint.
+
+        Raises:
+            DivergedError: if a weight is not finite; the earlier checkpoints are kept.
+        """
+        check_weights(self.learner.loss, self.recorder.frames)
+        self.board.flush()  # what it has logged is on disk before the checkpoint that says so
+        self.state.save(ended=self.ends)
+
+    def tidy(self) -> None:
+        """Delete the checkpoints that are no longer kept."""
+        self.state.tidy()
+
+    def conclude(self) -> None:
+        """Draw the training curve and delete the replay files."""
+        curves = {name: np.array(values) for name, values in self.recorder.episodes.finished.items()}
+        save_training_curve(curves, self.folder / "figures" / "training.png")
+        self.state.finish()
+
+    def summary(self, seconds: Seconds, n_seeds: int) -> dict:
+        """The content of summary.json; the time is that of the program, which trained ``n_seeds`` runs."""
+        wall_time, frames = seconds.total(), self.recorder.frames
+        speed = {"wall_time_s": wall_time, "frames_per_second": frames / wall_time, "time": seconds.totals}
+        speed |= {"n_seeds": n_seeds}
+        kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}}
+        return self.origin | self.recorder.summary() | speed | kept | {"eval": self.recorder.evaluation}
+
+
+def begin_together(runs: Sequence[TrainingRun], tell: Callable[[str], None]) -> int:
+    """Begin all runs at the same frame, which is returned: the newest that all have a checkpoint of, or 0.
+
+    Raises:
+        CheckpointError: if the runs have come so differently far that some would lose more than one interval.
+    """
+    if len(runs) == 1 or runs[0].config.resume == "never":
+        for run in runs:
+            run.begin(tell)
+        return runs[0].recorder.frames
+    newest = {run.seed: run.state.newest_frames(tell) for run in runs}
+    start = min(frames or 0 for frames in newest.values())
+    for run in runs:
+        frames = newest[run.seed]
+        if frames and start not in run.state.saved_frames():
+            fresh = [seed for seed, found in newest.items() if (found or 0) == start]
+            raise CheckpointError(
+                f"seed {run.seed} has come to {frames} frames, seed {fresh[0]} to {start}: they cannot go on together. Train them "
+                "in programs of their own (seed=, or seeds= of those that are equally far), or anew with resume=never."
+            )
+    for run in runs:
+        run.begin(tell, start or -1)  # at 0 all begin anew
+        if run.recorder.frames != start:
+            raise CheckpointError(
+                f"seed {run.seed}: the checkpoint of {start} frames cannot be used. Train it alone first."
+            )
+        if not start:
+            run.state.save()  # so that programs killed inside the first round of checkpoints can begin anew
+    return start
+
+
+def for_each(runs: Sequence[TrainingRun], act: Callable[..., object], *arguments: Sequence) -> None:
+    """Call ``act(run, argument, ..)`` for every run that has not failed; one that fails does not end the others.
+
+    Args:
+        runs: the program's runs.
+        act: what to do.
+        arguments: lists with an entry per run.
+
+    Raises:
+        Exception: what ``act`` raises, where there is no other run to go on with.
+    """
+    for run, *own in zip(runs, *arguments, strict=True):
+        if run.error is not None:
+            continue
+        try:
+            act(run, *own)
+        except FAILURES as error:
+            run.error = error
+            if all(other.error is not None for other in runs):
+                raise
+
+
+def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequence:
+    """Each run's part of ``rows``, which hold the runs' worlds one after the other."""
+    return rows.chunk(len(runs)) if len(rows) else [rows] * len(runs)
+
+
+def minibatch(runs: Sequence[TrainingRun]) -> TensorDictBase:
+    """Transitions for one update: ``(batch,)`` of the only run, ``(K, batch)`` of several."""
+    if len(runs) == 1:
+        return runs[0].buffer.sample()
+    samples = [run.buffer.sample() if run.error is None else None for run in runs]
+    stand_in = next(
+        sample for sample in samples if sample is not None
+    )  # what a failed run's networks are fed is all the same
+    return torch.stack([stand_in if sample is None else sample for sample in samples])  # pyright: ignore[reportReturnType]
+
+
+def check_seeds(runs: Sequence[TrainingRun]) -> None:
+    """Raise a :class:`SeedsFailedError` if a run failed."""
+    failed = [f"seed {run.seed}: {run.error}" for run in runs if run.error is not None]
+    if failed:
+        raise SeedsFailedError(
+            "\n".join([f"{len(failed)} of {len(runs)} seeds failed, the others are complete.", *failed])
+        )
