@@ -25,7 +25,7 @@ from agents.run import TrainingRun, begin_together, check_seeds, for_each, minib
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
 from conf.naming import hashed_config
-from conf.run_folder import announce_certificate, unfinished_seeds, write_json
+from conf.run_folder import announce_certificate, objective, run_folders, unfinished_seeds, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
 from envs import SurveillanceEnv, keys
@@ -37,13 +37,14 @@ logging.getLogger("torchrl").setLevel(logging.WARNING)
 @clear_errors(Config)
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 @one_clear_error
-def main(cfg: DictConfig) -> None:
-    """One run in Hydra's run folder, or one run per seed as a batch, each in a folder of its own."""
+def main(cfg: DictConfig) -> float | None:
+    """One run in Hydra's run folder, or one run per seed as a batch, each in a folder of its own. Returns the coverage cost."""
     config: Config = to_config(cfg)
     output = Path(HydraConfig.get().runtime.output_dir)
+    all_folders = run_folders(cfg, config.all_seeds, output).values()
     folders = unfinished_seeds(cfg, config.all_seeds, output, tqdm.write)
     if not folders:
-        return
+        return objective(all_folders)
 
     # ---- build: every random stream of a seed has a seed of its own; the global one draws the initial weights only
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
@@ -126,6 +127,7 @@ def main(cfg: DictConfig) -> None:
         run.board.close()
         tqdm.write(f"{run.folder}/summary.json\n{json.dumps(run.recorder.evaluation, indent=2)}")
     check_seeds(runs)
+    return objective(all_folders)
 
 
 if __name__ == "__main__":

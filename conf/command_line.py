@@ -7,26 +7,24 @@ import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hydra._internal import utils as hydra_utils
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from agents.incident import ViolationError
+from conf.launching import missing_plugin
 from conf.manual import explain
+from conf.sweep import checked_sweeps
+from conf.sweep_jobs import FAILED_JOBS
 
 FULL = "HYDRA_FULL_ERROR"
-EXPECTED = (ValueError, OSError, OmegaConfBaseException, ViolationError)
-"""Errors whose message says all; the others are programming errors and show their traceback."""
 QUOTING = (
     "An override is name=value, or group=option; values with spaces, commas, = or brackets need quotes for Hydra inside quotes "
     "for the shell: 'name=\"a value\"'. python <program> --help lists the options."
 )
-ENTRY = {"command_line.py", "train.py", "evaluate.py", "report.py"}
-FAILED_JOBS: list[tuple[Sequence[str], BaseException]] = []
-"""Overrides and error of the jobs of this process's multirun that failed."""
+ENTRY = {"command_line.py", "sweep.py", "train.py", "evaluate.py", "report.py"}
 
 
 def wants_traceback() -> bool:
@@ -55,27 +53,32 @@ def clear_errors(schema: type) -> Callable[[Callable[[], None]], Callable[[], No
         @functools.wraps(main)
         def wrapper() -> None:
             if wants_traceback():
-                main()
-                return
-            _check_flags()
-            FAILED_JOBS.clear()
-            with _raising():
-                try:
+                with checked_sweeps():
                     main()
-                except (HydraException, OmegaConfBaseException) as error:
-                    if not FAILED_JOBS:
-                        fail(describe(error, schema))
-                except Exception as error:
-                    if not FAILED_JOBS and not _is_hydras(error):  # a programming error of this project
-                        raise
-                    if not FAILED_JOBS:
-                        fail(f"Hydra cannot combine these overrides ({type(error).__name__}: {error}). {QUOTING}")
+            else:
+                _check_flags()
+                with _raising(), checked_sweeps():
+                    _explain(main, schema)
             if FAILED_JOBS:
                 list_failures()
 
         return wrapper
 
     return decorate
+
+
+def _explain(main: Callable[[], None], schema: type) -> None:
+    """Run ``main``; what Hydra refuses ends in one message."""
+    try:
+        main()
+    except (HydraException, OmegaConfBaseException) as error:
+        if not FAILED_JOBS:
+            fail(describe(error, schema))
+    except Exception as error:
+        if not FAILED_JOBS and not _is_hydras(error):  # a programming error of this project
+            raise
+        if not FAILED_JOBS:
+            fail(f"Hydra cannot combine these overrides ({type(error).__name__}: {error}). {QUOTING}")
 
 
 @contextlib.contextmanager
@@ -107,13 +110,12 @@ def _check_flags() -> None:
 
 
 def list_failures() -> None:
-    """Name the failed jobs of a multirun, one after the other, and leave with exit code 1."""
+    """Name the failed jobs of a multirun, one after the other, with their logs, and leave with exit code 1."""
     sys.stderr.write(f"error: {len(FAILED_JOBS)} of the sweep's runs failed; the others are complete:\n")
-    for overrides, error in FAILED_JOBS:
-        if not isinstance(error, EXPECTED):
-            traceback.print_exception(error)
-        first = " ".join(str(error).split()) or type(error).__name__
-        sys.stderr.write(f"  {' '.join(overrides)}: {textwrap.shorten(first, 300)}\n")
+    for job in FAILED_JOBS:
+        first = " ".join(str(job.error).split()) or type(job.error).__name__
+        where = f" [{job.log}]" if job.log else ""
+        sys.stderr.write(f"  {' '.join(job.overrides)}: {textwrap.shorten(first, 300)}{where}\n")
     sys.exit(1)
 
 
@@ -124,6 +126,8 @@ def describe(error: BaseException, schema: type) -> str:
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} is not an override: {' '.join(str(error).split('See https')[0].split())}\n{QUOTING}"
     if isinstance(error, MissingConfigException):
+        if message := missing_plugin(str(error.missing_cfg_file).removesuffix(".yaml")):
+            return message
         listed = [line.strip() for line in text.split("Available options in")[-1].splitlines()[1:]]
         options = [name for name in listed if re.fullmatch(r"[\w-]+", name)]
         named = re.search(r"'([^']+/[^']+|[^']+)'(?=\s*$|\n)", text.splitlines()[0])

@@ -10,6 +10,8 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig, OmegaConf
+
 WIDTH = 110
 
 
@@ -90,6 +92,19 @@ def explain(schema: type, key: str) -> str:
     ending = [name for name in known if name.split(".")[-1] == key.split(".")[-1]]
     guess = list(dict.fromkeys([*ending, *near]))[:4]
     return f"There is no option {key!r}. " + (f"Did you mean {' or '.join(guess)}?" if guess else "")
+
+
+def check_names(cfg: DictConfig, prefix: str = "", schema: type | None = None) -> None:
+    """Refuse options that were added (+name=) or deleted (~name): the first would do nothing, the second is not meant."""
+    schema = schema or OmegaConf.get_type(cfg)
+    known = {entry.name for entry in dataclasses.fields(OmegaConf.get_type(cfg))}
+    for key in sorted({str(key) for key in cfg} ^ known):
+        if key in known:
+            raise ValueError(f"~{prefix}{key}: options cannot be deleted; leave it out for its default.")
+        raise ValueError(explain(schema, f"{prefix}{key}") + " python <program> --help lists all options.")
+    for key in cfg:
+        if OmegaConf.is_dict(value := cfg._get_node(key)) and dataclasses.is_dataclass(OmegaConf.get_type(value)):
+            check_names(value, f"{prefix}{key}.", schema)  # pyright: ignore[reportArgumentType]
 
 
 def _shown(value: Any) -> str:

@@ -1,15 +1,25 @@
 """What stands in the folder of a run or of an evaluation: whether it is finished, the certificate's quantities, JSON files."""
 
+import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tqdm import tqdm
 
-from conf.naming import program_name, run_name, seeds_of
+from conf.naming import config_hash, program_name, run_name, seeds_of
 from envs import SurveillanceConfig
 from envs.inequalities import derived_quantities
+
+try:
+    import fcntl
+except ImportError:  # not POSIX: no locks
+    fcntl = None
+
+
+class BusyFolderError(ValueError):
+    """A run's folder that another process is writing."""
 
 
 def announce_certificate(folder: Path, world: SurveillanceConfig, *, show: bool = True) -> None:
@@ -78,8 +88,15 @@ def finished_evaluation(path: Path, asked: dict) -> bool:
 
 def finished_program(cfg: DictConfig) -> str | None:
     """What to tell the user if all runs of a program of train.py are finished and to be left alone; None otherwise."""
-    folders = run_folders(cfg, seeds_of(cfg), Path(str(cfg.hydra.run.dir))).values()
-    messages = [finished_run(folder, cfg.resume) for folder in folders]
+    folders = run_folders(cfg, seeds_of(cfg), Path(str(cfg.hydra.run.dir)))
+    messages = [finished_run(folder, cfg.resume) for folder in folders.values()]
+    foreign = [
+        foreign_run(folder, cfg, seed)
+        for (seed, folder), message in zip(folders.items(), messages, strict=True)
+        if message
+    ]
+    if any(foreign):
+        raise ValueError(next(filter(None, foreign)))
     return "\n".join(filter(None, messages)) if all(messages) else None
 
 
@@ -90,6 +107,53 @@ def finished_run(folder: Path, resume: str | None) -> str | None:
     if folder.resolve() in (Path(resume).resolve(), *Path(resume).resolve().parents):  # one of its own checkpoints
         return None
     return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
+
+
+def foreign_run(folder: Path, cfg: DictConfig, seed: int) -> str | None:
+    """What is wrong with ``folder`` if it holds a training run of another configuration than ``cfg``, or of another seed."""
+    path = folder / ".hydra" / "config.yaml"
+    if folder.name == run_name(cfg, seed) or not path.is_file():
+        return None
+    there, digest = OmegaConf.load(path), config_hash(cfg)
+    if not isinstance(there, DictConfig) or (there.get("seed"), config_hash(there)) == (seed, digest):
+        return None
+    return (
+        f"{folder} holds a run of another configuration (hash {config_hash(there)}, seed {there.get('seed')}; this one: "
+        f"{digest}, seed {seed}): give this run another folder (hydra.run.dir, hydra.sweep.dir, hydra.sweep.subdir), "
+        "or move that one away."
+    )
+
+
+def objective(folders: Iterable[Path]) -> float | None:
+    """The coverage cost that finished runs were evaluated with, their mean, m²: what a sweep for tuning makes small.
+
+    None where one of them has none.
+    """
+    try:
+        summaries = [json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in folders]
+        return sum(float(summary["eval"]["coverage_cost"]) for summary in summaries) / len(summaries)
+    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
+        return None
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Context in which no other process runs in ``folder``.
+
+    Raises:
+        BusyFolderError: one does already.
+    """
+    if fcntl is None or not (folder / ".hydra").is_dir():  # report.py has no folder of its own
+        yield
+        return
+    with (folder / ".hydra" / "lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BusyFolderError(f"{folder} is being written by another process: wait for it, or stop it.") from error
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def write_json(path: Path, content: dict) -> None:

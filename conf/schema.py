@@ -1,7 +1,6 @@
 """Registration of the typed configurations with Hydra, and the checks that need what Hydra composed."""
 
 import re
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,8 @@ from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, wor
 from agents.training_config import Config
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig
-from conf.manual import explain, groups, manual
+from conf.launching import register_resolvers
+from conf.manual import check_names, groups, manual
 from conf.naming import GROUPS, config_hash, evaluation_folder, hashed_config, program_name
 from conf.report_schema import ReportConfig
 from envs import SurveillanceConfig, SurveillanceEnv
@@ -28,6 +28,7 @@ def register() -> None:
     store.store(name="evaluate_schema", node=EvaluateConfig)
     store.store(name="report_schema", node=ReportConfig)
     OmegaConf.register_new_resolver("config_hash", lambda *, _root_: config_hash(_root_), replace=True)
+    register_resolvers()
     OmegaConf.register_new_resolver("program_name", lambda *, _root_: program_name(_root_), replace=True)
     schemas = {"train": Config, "evaluate": EvaluateConfig, "report": ReportConfig}
     OmegaConf.register_new_resolver("manual", lambda program: manual(schemas[program]), replace=True)
@@ -45,7 +46,7 @@ def to_config(cfg: DictConfig) -> Any:
     own = cfg.copy()
     with open_dict(own):
         own.pop("hydra", None)
-    _check_names(own)
+    check_names(own)
     if "run" in own and own.run is not None:  # world and filter are the run's: run_config applies the overrides to them
         own.env, own.safety = OmegaConf.structured(SurveillanceConfig), OmegaConf.structured(SafetyConfig)
     return OmegaConf.to_object(own)
@@ -58,18 +59,6 @@ def _check_groups(cfg: DictConfig) -> None:
         group = re.split("[=@]", str(override))[0]
         if group.startswith("~") and group[1:] in GROUPS:
             raise ValueError(f"{override}: groups cannot be deleted; choose a file of it with {group[1:]}=<name>.")
-
-
-def _check_names(cfg: DictConfig, prefix: str = "") -> None:
-    """Refuse options that were added (+name=) or deleted (~name): the first would do nothing, the second is not meant."""
-    known = {entry.name for entry in fields(OmegaConf.get_type(cfg))}
-    for key in sorted({str(key) for key in cfg} ^ known):
-        if key in known:
-            raise ValueError(f"~{prefix}{key}: options cannot be deleted; leave it out for its default.")
-        raise ValueError(explain(Config, f"{prefix}{key}") + " python <program> --help lists all options.")
-    for key in cfg:
-        if OmegaConf.is_dict(value := cfg._get_node(key)) and is_dataclass(OmegaConf.get_type(value)):
-            _check_names(value, f"{prefix}{key}.")  # pyright: ignore[reportArgumentType]
 
 
 def run_config(cfg: DictConfig, overrides: list[str]) -> Config:

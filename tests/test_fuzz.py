@@ -194,7 +194,7 @@ def test_accepted_configurations_run(program, tmp_path):
         tried += 1
         overrides = [one(draw, [name for name in names if name not in fixed]) for _ in range(2)]
         if any(
-            entry.split("=")[0].lstrip("+~") in (*fixed, "train", "experiment", "method", "threads")
+            entry.split("=")[0].lstrip("+~") in (*fixed, "train", "experiment", "method", "threads", "debug")
             for entry in overrides
         ):
             continue
