@@ -16,16 +16,28 @@ from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents.interruption import StopSignals
-from agents.learners import LearnerStack, make_learners
+from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import ExplorationNoise, make_policies
 from agents.pipeline import MultiStep, collect, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds
-from agents.run import TrainingRun, begin_together, check_seeds, for_each, minibatch, seeds_of_streams, shares
+from agents.run import (
+    FAILURES,
+    SeedsFailedError,
+    TrainingRun,
+    check_seeds,
+    equally_far,
+    errors_by_seed,
+    for_each,
+    minibatch,
+    seeds_of_streams,
+    shares,
+    stopped_at,
+)
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
 from conf.naming import hashed_config
-from conf.run_folder import announce_certificate, objective, run_folders, unfinished_seeds, write_json
+from conf.run_folder import announce_certificate, objective, only_writers, run_folders, unfinished_seeds, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
 from envs import SurveillanceEnv, keys
@@ -43,9 +55,22 @@ def main(cfg: DictConfig) -> float | None:
     output = Path(HydraConfig.get().runtime.output_dir)
     all_folders = run_folders(cfg, config.all_seeds, output).values()
     folders = unfinished_seeds(cfg, config.all_seeds, output, tqdm.write)
-    if not folders:
-        return objective(all_folders)
+    failed: dict[int, str] = {}
+    with only_writers(folder for folder in folders.values() if folder != output):
+        for start, group in equally_far(folders, config.resume, tqdm.write) if folders else ():
+            try:
+                train(cfg, config, group, start)
+            except (SeedsFailedError, *FAILURES) as error:
+                if len(folders) == 1:
+                    raise
+                failed |= errors_by_seed(error, group)
+    if failed:
+        raise SeedsFailedError(failed, len(all_folders) - len(failed))
+    return objective(all_folders)
 
+
+def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int) -> None:
+    """Train the seeds of ``folders`` as one batch, from a checkpoint of ``start`` frames where there are several."""
     # ---- build: every random stream of a seed has a seed of its own; the global one draws the initial weights only
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
     device = pick_device(config.device)
@@ -79,9 +104,10 @@ def main(cfg: DictConfig) -> float | None:
     ]
 
     # ---- resume: runs that were killed go on where their newest common checkpoint left them
-    start = begin_together(runs, tqdm.write)
-    if isinstance(learner, LearnerStack):
-        learner.gather_moments()
+    for run in runs:
+        run.begin(tqdm.write, start or -1 if len(runs) > 1 else None)
+    start = runs[0].recorder.frames
+    learner.gather_moments()
     for run in runs:
         announce_certificate(run.folder, world, show=run is runs[0])
     seconds.spent("build")
@@ -112,22 +138,20 @@ def main(cfg: DictConfig) -> float | None:
             seconds.spent("evaluate")
             due = [run.saves for run in runs]
             if any(due) or stop.received:
-                if isinstance(learner, LearnerStack):
-                    learner.share_moments()
+                learner.share_moments()
                 for_each(runs, TrainingRun.save)
                 for_each(runs, TrainingRun.tidy)  # when all have theirs
             seconds.spent("checkpoint")
-            stop.check(f"at {runs[0].recorder.frames} frames, checkpoint written in {output}")
+            stop.check(stopped_at(runs))
     bar.close()
 
     # ---- conclude
     for_each(runs, TrainingRun.conclude)
     for_each(runs, lambda run: write_json(run.folder / "summary.json", run.summary(seconds, n_runs)))
-    for run in runs:
-        run.board.close()
-        tqdm.write(f"{run.folder}/summary.json\n{json.dumps(run.recorder.evaluation, indent=2)}")
+    for_each(
+        runs, lambda run: tqdm.write(f"{run.folder}/summary.json\n{json.dumps(run.recorder.evaluation, indent=2)}")
+    )
     check_seeds(runs)
-    return objective(all_folders)
 
 
 if __name__ == "__main__":

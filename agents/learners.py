@@ -1,9 +1,10 @@
 """One learner per seed, or several updated as one batch.
 
 The tensors of stacked learners are slices of larger ones: every learner keeps modules of its own, whose parameters share
-memory with the stack's, so that evaluation and checkpoints see single learners and one update serves all. On a CPU each
-learner comes out as it would alone, to the bit: the stack multiplies matrices learner by learner and adds up nothing
-across them.
+memory with the stack's, so that evaluation and checkpoints see single learners and one update serves all. Nothing is added
+up across learners. On a CPU each comes out as it would alone, to the bit, where the matrix products of a batch have the bits
+of single ones: so with the default's layers and robots; not with one robot, in float64 or with layers of odd sizes, where
+it is to rounding.
 """
 
 from collections.abc import Sequence
@@ -41,6 +42,12 @@ class Learner:
     def updates(self) -> tuple[MADDPGLoss, dict[str, torch.optim.Optimizer], SoftUpdate]:
         """What :func:`agents.maddpg.update_step` needs."""
         return self.loss, self.optimizers, self.target_updater
+
+    def gather_moments(self) -> None:
+        """Nothing: the optimisers are the learner's own."""
+
+    def share_moments(self) -> None:
+        """Nothing, as before."""
 
 
 def make_learner(

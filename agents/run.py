@@ -1,7 +1,8 @@
 """The run of one seed: its replay buffer, counters, curves and checkpoints; several of them share collector and updates."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from agents.networks import ExplorationNoise
 from agents.pipeline import WaitingSteps, make_buffer
 from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_config import Config
-from agents.training_state import TrainingState
+from agents.training_state import TrainingState, valid_ages
 from envs import SurveillanceEnv, keys
 from envs.blocks import WorldBlock
 from envs.rendering import save_training_curve
@@ -30,7 +31,22 @@ FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
 
 
 class SeedsFailedError(RuntimeError):
-    """Some seeds of a program failed; the message names them, the others are complete."""
+    """Some seeds of a program failed; the message names them and quotes the first error.
+
+    Args:
+        errors: what ended each, by seed.
+        others: number of the seeds that did not fail.
+    """
+
+    def __init__(self, errors: dict[int, str], others: int) -> None:
+        super().__init__(errors, others)  # all arguments: the error of a run in another process is pickled
+        self.errors, self.others = errors, others
+
+    def __str__(self) -> str:
+        """The message."""
+        seeds = ", ".join(map(str, self.errors))
+        first, error = next(iter(self.errors.items()))
+        return f"{len(self.errors)} of {len(self.errors) + self.others} seeds failed: {seeds}.\nseed {first}: {error}"
 
 
 def seeds_of_streams(seed: int) -> list[int]:
@@ -98,9 +114,21 @@ class TrainingRun:
         self.progress = ""
         """What the progress bar shows."""
 
-    def begin(self, tell: Callable[[str], None], latest: int | None = None) -> None:
-        """Go on from a checkpoint if there is one (see :meth:`TrainingState.resume`), and open the curves."""
+    def begin(self, tell: Callable[[str], None], latest: int | None) -> None:
+        """Go on from a checkpoint if there is one (see :meth:`TrainingState.resume`), and open the curves.
+
+        Args:
+            tell: shows a line to the user.
+            latest: frames at which the program's runs begin together, -1 for the start; None for a run alone.
+
+        Raises:
+            CheckpointError: if it has no checkpoint of just these frames.
+        """
         kept_rows = self.state.resume(self.config.resume, tell, latest)
+        if latest is not None and self.recorder.frames != max(latest, 0):
+            raise CheckpointError(
+                f"seed {self.seed}: its checkpoint of {latest} frames is gone. Start the program again."
+            )
         self.learns_from += 0 if kept_rows else self.recorder.frames
         log, settings = self.config.log, self.settings | {"seed": self.seed}
         self.board = Board(self.folder, self.recorder.frames, settings, figures=log.figures, gif=log.gif)
@@ -200,45 +228,44 @@ class TrainingRun:
         curves = {name: np.array(values) for name, values in self.recorder.episodes.finished.items()}
         save_training_curve(curves, self.folder / "figures" / "training.png")
         self.state.finish()
+        self.board.close()
 
     def summary(self, seconds: Seconds, n_seeds: int) -> dict:
         """The content of summary.json; the time is that of the program, which trained ``n_seeds`` runs."""
         wall_time, frames = seconds.total(), self.recorder.frames
         speed = {"wall_time_s": wall_time, "frames_per_second": frames / wall_time, "time": seconds.totals}
-        speed |= {"n_seeds": n_seeds}
+        speed |= {"n_seeds": n_seeds} if n_seeds > 1 else {}
         kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}}
         return self.origin | self.recorder.summary() | speed | kept | {"eval": self.recorder.evaluation}
 
 
-def begin_together(runs: Sequence[TrainingRun], tell: Callable[[str], None]) -> int:
-    """Begin all runs at the same frame, which is returned: the newest that all have a checkpoint of, or 0.
+def equally_far(
+    folders: Mapping[int, Path], resume: str, tell: Callable[[str], None]
+) -> list[tuple[int, dict[int, Path]]]:
+    """Seeds that can be trained as one batch, because all have a valid checkpoint of the same frames and updates, or none.
 
-    Raises:
-        CheckpointError: if the runs have come so differently far that some would lose more than one interval.
+    A program that was killed between its seeds' checkpoints goes on where all of them have one; seeds with another history
+    (of single runs, or one that failed) form groups of their own.
+
+    Args:
+        folders: the folder of each seed's run.
+        resume: ``auto``; anything else does not look for checkpoints.
+        tell: shows a line for each damaged checkpoint.
+
+    Returns:
+        Frames to go on from and folders by seed, the largest group first.
     """
-    if len(runs) == 1 or runs[0].config.resume == "never":
-        for run in runs:
-            run.begin(tell)
-        return runs[0].recorder.frames
-    newest = {run.seed: run.state.newest_frames(tell) for run in runs}
-    start = min(frames or 0 for frames in newest.values())
-    for run in runs:
-        frames = newest[run.seed]
-        if frames and start not in run.state.saved_frames():
-            fresh = [seed for seed, found in newest.items() if (found or 0) == start]
-            raise CheckpointError(
-                f"seed {run.seed} has come to {frames} frames, seed {fresh[0]} to {start}: they cannot go on together. Train them "
-                "in programs of their own (seed=, or seeds= of those that are equally far), or anew with resume=never."
-            )
-    for run in runs:
-        run.begin(tell, start or -1)  # at 0 all begin anew
-        if run.recorder.frames != start:
-            raise CheckpointError(
-                f"seed {run.seed}: the checkpoint of {start} frames cannot be used. Train it alone first."
-            )
-        if not start:
-            run.state.save()  # so that programs killed inside the first round of checkpoints can begin anew
-    return start
+    if len(folders) == 1 or resume != "auto":
+        return [(0, dict(folders))]
+    ages = {seed: valid_ages(folder / "checkpoints", tell) or {(0, 0)} for seed, folder in folders.items()}
+    groups = []
+    while ages:
+        counts = Counter(age for own in ages.values() for age in own)
+        age = max(counts, key=lambda age: (counts[age], age))
+        group = [seed for seed, own in ages.items() if age in own]
+        groups.append((age[0], {seed: folders[seed] for seed in group}))
+        ages = {seed: own for seed, own in ages.items() if seed not in group}
+    return groups
 
 
 def for_each(runs: Sequence[TrainingRun], act: Callable[..., object], *arguments: Sequence) -> None:
@@ -258,9 +285,20 @@ def for_each(runs: Sequence[TrainingRun], act: Callable[..., object], *arguments
         try:
             act(run, *own)
         except FAILURES as error:
-            run.error = error
-            if all(other.error is not None for other in runs):
+            if len(runs) == 1:
                 raise
+            run.error = error
+            run.board.close()
+    if all(run.error is not None for run in runs):
+        check_seeds(runs)
+
+
+def stopped_at(runs: Sequence[TrainingRun]) -> str:
+    """How far a program is that was asked to stop, and where its checkpoints are, for the message."""
+    good = [run for run in runs if run.error is None]
+    where = good[0].folder if len(runs) == 1 else f"the folders of {len(good)} seeds"
+    lost = "".join(f"; seed {run.seed} had failed: {run.error}" for run in runs if run.error is not None)
+    return f"at {good[0].recorder.frames} frames, checkpoint written in {where}{lost}"
 
 
 def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequence:
@@ -273,16 +311,16 @@ def minibatch(runs: Sequence[TrainingRun]) -> TensorDictBase:
     if len(runs) == 1:
         return runs[0].buffer.sample()
     samples = [run.buffer.sample() if run.error is None else None for run in runs]
-    stand_in = next(
-        sample for sample in samples if sample is not None
-    )  # what a failed run's networks are fed is all the same
+    stand_in = next(sample for sample in samples if sample is not None)  # for failed runs, whose networks are lost
     return torch.stack([stand_in if sample is None else sample for sample in samples])  # pyright: ignore[reportReturnType]
+
+
+def errors_by_seed(error: Exception, seeds: Iterable[int]) -> dict[int, str]:
+    """What ended each seed of a program that ``error`` has ended."""
+    return error.errors if isinstance(error, SeedsFailedError) else {seed: str(error) for seed in seeds}
 
 
 def check_seeds(runs: Sequence[TrainingRun]) -> None:
     """Raise a :class:`SeedsFailedError` if a run failed."""
-    failed = [f"seed {run.seed}: {run.error}" for run in runs if run.error is not None]
-    if failed:
-        raise SeedsFailedError(
-            "\n".join([f"{len(failed)} of {len(runs)} seeds failed, the others are complete.", *failed])
-        )
+    if failed := {run.seed: run.error for run in runs if run.error is not None}:
+        raise SeedsFailedError({seed: str(error) for seed, error in failed.items()}, len(runs) - len(failed))

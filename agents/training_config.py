@@ -155,8 +155,8 @@ class Config:
     """Seed of every random stream, 0..2^31."""
     n_seeds: int = 1
     """Train the seeds seed, seed + 1, .. in one program, 1..1000: as many independent learners stepped and updated as one
-    batch. Each has the folder, files and (on a CPU, to the bit) results of a run of its own; those that are finished are
-    left out."""
+    batch. Each has the folder, files and results of a run of its own (on a CPU to the bit, but for one robot, float64 and
+    layers of odd sizes: to rounding); those that are finished are left out."""
     seeds: list[int] | None = None
     """The same with these seeds, such as 'seeds=[0,3,7]'; null = n_seeds of them."""
     device: str = "auto"

@@ -83,11 +83,6 @@ class TrainingState:
         if self.replay is not None:
             self.replay.prune()
 
-    def newest_frames(self, tell: Callable[[str], None]) -> int | None:
-        """Frames of the newest valid checkpoint of this run's folder; None if there is none."""
-        found = newest_valid(self.folder, tell)
-        return None if found is None else found[1]["frames"]
-
     def save_best(self) -> None:
         """Write the policy alone to ``best.pt``: the one with the least coverage cost in an evaluation so far."""
         content = {**self.origin, "frames": self.parts["recorder"].frames, "actor": self.parts["actor"].state_dict()}
@@ -97,11 +92,6 @@ class TrainingState:
         """Delete the replay files of a finished run: only a run that goes on needs them."""
         if self.replay is not None:
             self.replay.clear()
-
-    def saved_frames(self) -> set[int]:
-        """Frames of this folder's checkpoints, 0 for a run that never was far from its start."""
-        found = {frames_of(path) for path in checkpoints(self.folder)}
-        return found if found else {0}
 
     def resume(self, resume: str, tell: Callable[[str], None], latest: int | None = None) -> bool:
         """Restore what ``resume`` names.
@@ -169,6 +159,20 @@ def newest_valid(folder: Path, tell: Callable[[str], None], latest: int | None =
         except CheckpointError as error:
             tell(f"passed over: {error}")
     return None
+
+
+def valid_ages(folder: Path, tell: Callable[[str], None]) -> set[tuple[int, int]]:
+    """Frames and updates of the checkpoints of a ``checkpoints`` folder that a run can go on from."""
+    ages = set()
+    for path in checkpoints(folder):
+        try:
+            content = load_resumable(path)
+        except CheckpointError as error:
+            tell(f"passed over: {error}")
+            continue
+        moments = content["parts"]["optimizers"]["loss_value"]["state"]
+        ages.add((content["frames"], int(next(iter(moments.values()))["step"]) if moments else 0))
+    return ages
 
 
 def named_checkpoint(path: Path, tell: Callable[[str], None]) -> tuple[Path, dict]:

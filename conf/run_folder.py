@@ -55,16 +55,19 @@ def unfinished_seeds(cfg: DictConfig, seeds: list[int], output: Path, tell: Call
     """
     folders = {}
     for seed, folder in run_folders(cfg, seeds, output).items():
-        if message := finished_run(folder, cfg.resume):
-            tell(message)
-            continue
-        folders[seed] = folder
-        if cfg.seeds is not None or cfg.n_seeds != 1:
+        message = finished_run(folder, cfg.resume)
+        if folder == output or not message:  # Hydra has rewritten its own
             _write_hydra_files(cfg, seed, folder, output)
+        if message:
+            tell(message)
+        else:
+            folders[seed] = folder
     return folders
 
 
 def _write_hydra_files(cfg: DictConfig, seed: int, folder: Path, output: Path) -> None:
+    if cfg.seeds is None and cfg.n_seeds == 1:
+        return
     own, source, target = cfg.copy(), output / ".hydra", folder / ".hydra"
     with open_dict(own):
         own.pop("hydra", None)
@@ -134,6 +137,15 @@ def objective(folders: Iterable[Path]) -> float | None:
         return sum(float(summary["eval"]["coverage_cost"]) for summary in summaries) / len(summaries)
     except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError):
         return None
+
+
+@contextlib.contextmanager
+def only_writers(folders: Iterable[Path]) -> Iterator[None]:
+    """:func:`only_writer` of several folders."""
+    with contextlib.ExitStack() as stack:
+        for folder in folders:
+            stack.enter_context(only_writer(folder))
+        yield
 
 
 @contextlib.contextmanager

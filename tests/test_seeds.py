@@ -9,13 +9,13 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from agents.checkpoint import checkpoints, load_checkpoint
+from agents.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from agents.config import AgentConfig
 from agents.learners import LearnerStack, make_learner, make_learners
 from agents.maddpg import clip_gradients, update_step
 from agents.networks import make_policies
 from agents.report_runs import find_runs
-from agents.run import TrainingRun
+from agents.run import TrainingRun, equally_far
 from conf.naming import config_hash
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.coverage import weighted_sum
@@ -39,9 +39,8 @@ VARIANTS = {
 def compared(folder: Path) -> dict:
     """What a run must share with the same seed's run in a program of its own."""
     content = result(folder)
-    content["summary"].pop("n_seeds")
+    content["summary"].pop("n_seeds", None)
     content["checkpoint"].pop("torch")  # the global stream, which nothing draws from after the start
-    content["files"] = [name for name in content["files"] if name != "frames_000000000000.pt"]
     return content
 
 
@@ -88,9 +87,9 @@ def test_a_stopped_program_goes_on_as_single_runs(tmp_path, alone):
     assert not differences(alone[1], compared(folder / "seed1"))
 
 
-def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(program, tmp_path, monkeypatch):
+def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(program, tmp_path, monkeypatch, alone):
     runs = tmp_path / "runs" / "smoke"
-    assert program(train.main, *SHORT)[0] == 0
+    assert program(train.main, *QUIET)[0] == 0
     (first,) = runs.glob("*_seed0")
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
 
@@ -100,27 +99,33 @@ def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(
         real(self, batch, *others)
 
     monkeypatch.setattr(TrainingRun, "take", take)
-    code, output = program(train.main, *SHORT, "n_seeds=4")
+    code, output = program(train.main, *QUIET, "n_seeds=4")
     assert code == 1
     error = output[output.index("error:") :].splitlines()
     assert len(error) <= 8
-    assert "1 of 3 seeds failed" in error[0]
+    assert "1 of 4 seeds failed: 2." in error[0]
     assert "seed 2: training diverged at frame 160: rewards not finite" in " ".join(output.split())
     assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
     finished = {path.parent.name[-1] for path in runs.glob("*_seed?/summary.json")}
     assert finished == {"0", "1", "3"}
     assert [path.name for path in runs.glob("*_seeds*")] == [f"{first.name.split('_')[0]}_seeds0-3"]
+    assert not differences(alone[1], compared(next(runs.glob("*_seed1"))))
 
+    monkeypatch.setattr(TrainingRun, "take", take)
+    code, output = program(train.main, *QUIET, "seeds=[4,2]")  # the others do not wait for it
+    assert code == 1
+    assert "1 of 2 seeds failed: 2." in output
+    assert list(runs.glob("*_seed4/summary.json"))
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    code, output = program(train.main, *SHORT, "n_seeds=4")  # the failed one goes on
+    code, output = program(train.main, *QUIET, "n_seeds=4")  # the failed one goes on
     assert code == 0, output
     assert "going on from" in output
-    code, output = program(train.main, *SHORT, "seeds=[2,0]")
+    code, output = program(train.main, *QUIET, "seeds=[2,0]")
     assert code == 0
     assert output.count("nothing to do") == 2
     found = find_runs(runs, config_hash)
-    assert [(run.seed, run.method, run.finished) for run in found] == [(k, found[0].method, True) for k in range(4)]
+    assert [(run.seed, run.method, run.finished) for run in found] == [(k, found[0].method, True) for k in range(5)]
     tags = EventAccumulator(str(found[2].folder)).Reload().Tags()["scalars"]
     assert "eval/coverage_cost" in tags
     assert json.loads((found[2].folder / "summary.json").read_text())["seed"] == 2
@@ -145,16 +150,51 @@ def test_bad_seeds(program, tmp_path, overrides, message):
     assert not (tmp_path / "runs").exists()
 
 
-def test_seeds_that_have_come_differently_far_are_refused(program, tmp_path):
+def test_seeds_that_have_come_differently_far_are_trained_in_turn(tmp_path, alone):
     folder = tmp_path / "program"
     folder.mkdir()
     code = run(folder / "seed1", (*QUIET, "seed=1"), stage="after checkpoint", count=5)
     assert code == -signal.SIGKILL, said(folder / "seed1")
-    kept = sorted((folder / "seed1" / "checkpoints").iterdir())
-    code, output = program(train.main, *QUIET, "n_seeds=2", f"hydra.run.dir={folder}")
-    assert code == 1
-    assert "seed 1 has come to 480 frames, seed 0 to 0: they cannot go on together" in " ".join(output.split())
-    assert sorted((folder / "seed1" / "checkpoints").iterdir()) == kept
+    assert run(folder, (*QUIET, "n_seeds=2")) == 0, said(folder)
+    assert f"going on from {folder}/seed1/checkpoints/frames_000000000480.pt" in said(folder)
+    assert not differences(alone, [compared(folder / f"seed{seed}") for seed in (0, 1)])
+
+
+def test_a_signal_writes_the_checkpoints_of_all_seeds(tmp_path, alone):
+    folder, arguments = tmp_path / "program", (*QUIET, "n_seeds=2", "checkpoint.interval_frames=0")
+    assert run(folder, arguments, stage="in training", count=5, by=signal.SIGTERM) == 128 + signal.SIGTERM, said(folder)
+    newest = {checkpoints(folder / f"seed{seed}" / "checkpoints")[-1].name for seed in (0, 1)}
+    assert len(newest) == 1
+    frames = int(newest.pop()[7:-3])
+    assert 0 < frames < 512
+    assert f"stopped by SIGTERM at {frames} frames, checkpoint written in the folders of 2 seeds" in said(folder)
+    assert run(folder, arguments) == 0, said(folder)
+    assert not differences([own["curves"] for own in alone], [compared(folder / f"seed{k}")["curves"] for k in (0, 1)])
+
+
+def test_groups_of_seeds(tmp_path):
+    def save(seed, *frames, updates=0):
+        for count in frames:
+            moments = {0: {"step": torch.tensor(float(count + updates))}}
+            parts = {"optimizers": {"loss_value": {"state": moments}}}
+            path = tmp_path / str(seed) / "checkpoints" / f"frames_{count:012d}.pt"
+            save_checkpoint(path, {"frames": count, "parts": parts})
+
+    def groups(*seeds):
+        found = equally_far({seed: tmp_path / str(seed) for seed in seeds}, "auto", [].append)
+        return [(start, sorted(group)) for start, group in found]
+
+    save(0, 100, 200)
+    save(1, 100)
+    save(2, 200, updates=1)  # the same frames, another history
+    save(3, 100, 200, 300)
+    assert groups(0, 1, 3) == [(100, [0, 1, 3])]
+    assert groups(0, 3) == [(200, [0, 3])]
+    assert groups(0, 2) == [(200, [2]), (200, [0])]
+    assert groups(4, 5, 0) == [(0, [4, 5]), (200, [0])]
+    (tmp_path / "1" / "checkpoints" / "frames_000000000100.pt").write_bytes(b"damaged")
+    assert groups(0, 1) == [(200, [0]), (0, [1])]
+    assert equally_far({0: tmp_path, 1: tmp_path}, "never", [].append) == [(0, {0: tmp_path, 1: tmp_path})]
 
 
 def test_blocks_of_worlds_are_worlds_of_their_own():
