@@ -1,5 +1,7 @@
 """Construction of the training pipeline: environment, collector and replay buffer."""
 
+import contextlib
+import ctypes
 import os
 from collections.abc import Iterator
 from typing import cast
@@ -33,6 +35,18 @@ def pick_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def keep_freed_memory() -> None:
+    """Keep the memory of freed tensors for the next ones instead of giving it back to the system, where glibc is in use.
+
+    Otherwise temporary tensors of more than 128 kB to 32 MB are mapped anew, and zeroed page by page, each time.
+    """
+    trim_threshold, mmap_threshold = -1, -3  # glibc's numbers
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(mmap_threshold, 32 << 20)
+        libc.mallopt(trim_threshold, 2**31 - 1)
+
+
 def use_threads(threads: int, *, deterministic: bool = False) -> None:
     """Compute on this many CPU threads; 0 leaves PyTorch's choice.
 
@@ -40,6 +54,7 @@ def use_threads(threads: int, *, deterministic: bool = False) -> None:
         threads: number of CPU threads.
         deterministic: refuse operations that may differ between runs.
     """
+    keep_freed_memory()
     if threads:
         torch.set_num_threads(threads)
     if deterministic:
