@@ -177,7 +177,8 @@ def _flat(content: Any, prefix: str) -> dict[str, float]:
 
 def _training_numbers(content: dict, run: Run) -> dict[str, float]:
     names = ("frames", "episodes", "wall_time_s", "frames_per_second")
-    numbers = {name: content[name] for name in names} | {"train.robot_steps": content["frames"] * run.n_agents}
+    numbers = {name: content[name] for name in names} | {"n_seeds": content.get("n_seeds", 1)}
+    numbers |= {"train.robot_steps": content["frames"] * run.n_agents}
     train = _flat(content["train"], "train") | _flat(content["filter"], "train.filter")
     return numbers | train | _flat(content["eval"], "eval")
 
@@ -251,6 +252,11 @@ def _warnings(runs: list[Run]) -> list[str]:
         budgets = [f"{run.numbers['frames']} frames" for run in own if run.learned]
         if len(set(budgets)) > 1:
             lines.append(f"world {world}: trained for {_count(budgets)}")
+    together = [run for run in runs if run.numbers.get("n_seeds", 1) > 1]
+    if together:
+        lines.append(
+            f"times of {len(together)} runs are those of programs that trained several seeds at once (n_seeds in runs.csv)"
+        )
     unmeasured = [run.label for run in runs if not np.isfinite(run.numbers["eval.coverage_cost"])]
     return [*lines, *filter(None, [_listed("no finite J", unmeasured, None)])]
 

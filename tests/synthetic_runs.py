@@ -50,6 +50,7 @@ def write_run(
     content = {"config_hash": changes.get("config_hash", "c0ffee00"), "git_hash": git_hash, "seed": seed, "eval": test}
     content |= {"frames": changes.get("frames", 100), "episodes": 5, "wall_time_s": 9.0, "frames_per_second": 11.0}
     content |= {"train": {"violations": dict.fromkeys(KINDS, seed)}, "filter": FILTER}
+    content |= {"n_seeds": changes["n_seeds"]} if "n_seeds" in changes else {}
     (folder / "summary.json").write_text(json.dumps(content))
     if changes.get("events", True):
         writer, start = SummaryWriter(str(folder)), time.time()
