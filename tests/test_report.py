@@ -380,7 +380,10 @@ def runs_of(folder):
     ("changes", "expected"),
     [
         ({"git_hash": "def"}, "runs of different commits: abc (1 runs), def (1 runs)"),
-        ({"n_seeds": 10}, "times of 1 runs are those of programs that trained several seeds at once"),
+        (
+            {"n_seeds": 10},
+            "times of 1 runs are those of programs that trained several seeds at once (n_seeds in runs.csv)",
+        ),
         (
             {"env": {"on_violation": "continue"}},
             "world default: env.on_violation is continue (1 runs), terminate (1 runs)",
