@@ -18,7 +18,7 @@ ReLU, shared parameters), minibatch, discount and learning rate; no evaluation, 
 The work is not the same. Only ours has the coverage integral, batteries and docking, the foresight of the critics, n-step
 targets, nominal beside executed actions, target actors, the counting of violations and the checks of every batch (column
 "store", with the buffer), and the certified filter; only VMAS simulates forces and contacts; its critics see all observations.
-Both profit from the memory that :func:`agents.pipeline.use_threads` keeps. frames/s end to end is of everything: collection,
+Both profit from the memory that :func:`agents.pipeline.use_threads` keeps. frames/s end to end is of everything: collection, counting,
 storing, sampling, updates. Evaluation, logging and checkpoints are in nobody's.
 
 Second table: parts of one iteration of train.py without these, of the default run and of ``experiment=paper``.
