@@ -1,4 +1,4 @@
-"""python tests/benchmarks/bench_training.py [--worlds 250] [--steps 100] [--repeats 5] [--no-shares] [override ...]
+"""python tests/benchmarks/bench_training.py [--worlds 250] [--steps 100] [--repeats 5] [--tables training,parts] [override ...]
 
 Training as a whole against TorchRL's MADDPG on VMAS simple_spread (needs vmas: ``pip install -e .[bench]``), 3 robots, one
 process, the contestants in turn, medians of the rounds. One round of each is ``--steps`` vector steps of its worlds and
@@ -17,9 +17,9 @@ ReLU, shared parameters), minibatch, discount and learning rate; no evaluation, 
 
 The work is not the same. Only ours has the coverage integral, batteries and docking, the foresight of the critics, n-step
 targets, nominal beside executed actions, target actors, the counting of violations and the checks of every batch (column
-"store", with the buffer), and the certified filter; only VMAS simulates forces and contacts; its critics see all observations.
-Both profit from the memory that :func:`agents.pipeline.use_threads` keeps. frames/s end to end is of everything: collection, counting,
-storing, sampling, updates. Evaluation, logging and checkpoints are in nobody's.
+"count"), and the certified filter; only VMAS simulates forces and contacts; its critics see all observations.
+Both profit from the memory that :func:`agents.pipeline.use_threads` keeps. frames/s end to end is of everything: collection,
+counting, storing, sampling, updates. Evaluation, logging and checkpoints are in nobody's.
 
 Second table: parts of one iteration of train.py without these, of the default run and of ``experiment=paper``.
 """
@@ -62,7 +62,7 @@ CONF = Path(__file__).resolve().parents[2] / "conf"
 MANY = 10
 SCRIPT, STEPWISE = "TorchRL, script's way", "TorchRL, one step a batch"
 UNFILTERED, CERTIFIED, SEEDS = "ours, unfiltered", "ours, certified", f"ours, certified, {MANY} seeds"
-PARTS = ("collect", "store", "sample", "update")
+PARTS = ("collect", "count", "store", "sample", "update")
 
 
 class Contestant:
@@ -76,6 +76,7 @@ class Contestant:
         sample: draws a minibatch.
         update: learns from one.
         end: called after the updates of a batch.
+        count: counts and checks a batch.
     """
 
     def __init__(
@@ -87,9 +88,11 @@ class Contestant:
         sample: Callable[[], TensorDictBase],
         update: Callable[[TensorDictBase], object],
         end: Callable[[], object] = lambda: None,
+        count: Callable[[TensorDictBase], object] = lambda batch: None,
     ) -> None:
         self.batches, self.frames, self.updates = batches, frames, updates
-        self.store, self.sample, self.update, self.end = store, sample, update, end
+        self.store, self.sample, self.update = store, sample, update
+        self.end, self.count = end, count
 
     def run(self, batches: int) -> dict[str, float]:
         """Seconds per frame of each part, over a number of batches."""
@@ -105,6 +108,8 @@ class Contestant:
         for _ in range(batches):
             batch = next(self.batches)
             done("collect")
+            self.count(batch)
+            done("count")
             self.store(batch)
             done("store")
             for _ in range(self.updates):
@@ -220,13 +225,15 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     seconds.watch("policy", explore)
     seconds.watch("filter", explore[-1])
 
-    def store(batch: TensorDictBase) -> None:
+    def count(batch: TensorDictBase) -> None:
         seconds.spent("collect")
-        steps = multi_step(to_transitions(batch, config.train.violation_penalty))
         for recorder, own in zip(recorders, batch.chunk(n_seeds), strict=True):
             recorder.update(own)
             check_violations(own, world=config.env, safety=config.safety, folder=folder)
             check_batch(own, recorder.frames)
+
+    def store(batch: TensorDictBase) -> None:
+        steps = multi_step(to_transitions(batch, config.train.violation_penalty))
         if len(steps):
             for buffer, own in zip(buffers, steps.chunk(n_seeds), strict=True):
                 buffer.extend(own)
@@ -243,7 +250,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     def update(minibatch: TensorDictBase) -> None:
         update_step(minibatch, *learner.updates, config.agent)
 
-    return Contestant(batches, per_batch, updates, store, sample, update), seconds
+    return Contestant(batches, per_batch, updates, store, sample, update, count=count), seconds
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------
@@ -296,7 +303,12 @@ def comparison(options, overrides: Sequence[str]) -> list[list]:
                     1 / spent["collect"],
                     best["collect"] / spent["collect"],
                 ),
-                *(1e6 * spent["store"], spent["sample"] * per_update, spent["update"] * per_update),
+                *(
+                    1e6 * spent["count"],
+                    1e6 * spent["store"],
+                    spent["sample"] * per_update,
+                    spent["update"] * per_update,
+                ),
                 *(1 / spent["all"], best["all"] / spent["all"]),
             ]
         )
@@ -328,21 +340,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=100, help="vector steps of a round, default 100")
     parser.add_argument("--repeats", type=int, default=5, help="rounds after the warm-up, default 5")
     parser.add_argument("--seeds", type=int, default=MANY, help=f"of the last row, default {MANY}; 1 leaves it out")
-    parser.add_argument("--no-shares", action="store_true", help="without the second table")
+    parser.add_argument("--tables", default="training,parts", help="which of the two, default training,parts")
     options, overrides = parser.parse_known_args(arguments)
     use_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     print(f"{harness.machine('cpu')}\n")
     header = (
-        *("worlds", "N", "training", "collected frames/s", "/ TorchRL", "store us", "sample ms", "update ms"),
+        *(
+            "worlds",
+            "N",
+            "training",
+            "collected frames/s",
+            "/ TorchRL",
+            "count us",
+            "store us",
+            "sample ms",
+            "update ms",
+        ),
         *("frames/s end to end", "/ TorchRL"),
     )
-    note = "Ratios are of frames/s, to the faster of TorchRL's two rows. Storing is per frame, sampling and update per update."
-    if harness.optional("vmas") is not None:
+    note = "Ratios of frames/s to the faster of TorchRL's two rows. Counting, storing: per frame; sampling, update: per update."
+    if "training" not in options.tables:
+        pass
+    elif harness.optional("vmas") is not None:
         harness.table("Training", header, comparison(options, overrides), note)
     else:
         print(harness.missing("vmas"))
-    if not options.no_shares:
+    if "parts" in options.tables:
         header = (
             "worlds",
             "N",
@@ -351,7 +375,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "filter",
             "inference",
             "env, collector",
-            "count, store",
+            "count",
+            "store",
             "sample",
             "update",
         )
