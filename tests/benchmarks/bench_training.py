@@ -31,6 +31,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import harness
 import torch
@@ -151,7 +152,7 @@ def baseline(config: Config, steps: int) -> Contestant:
         )
 
     actor = network(n_observation, n_action, agent.actor_cells, centralized=False)
-    space = spec[action_key].space
+    space: Any = spec[action_key].space
     policy = ProbabilisticActor(
         TensorDictModule(actor, in_keys=[("agents", "observation")], out_keys=[("agents", "param")]),
         spec=spec,
