@@ -99,3 +99,18 @@ def test_many_seeds_against_single_runs(load, capsys):
     rows = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith(("| 1", "| 2"))]
     assert [row[0].strip() for row in rows] == ["1", "2"]
     assert all(float(cell) > 0 for row in rows for cell in row)
+
+
+def test_training_against_torchrl(load, capsys):
+    pytest.importorskip("vmas")
+    sizes = ["--worlds", "8", "--steps", "2", "--repeats", "1", "--seeds", "2"]
+    load("bench_training").main([*sizes, "buffer.capacity=5000", "buffer.batch_size=8"])
+    out = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in out.splitlines() if line.startswith("| ")]
+    training, parts = rows[1:6], rows[7:]
+    assert [row[2] for row in training[2:]] == ["ours, unfiltered", "ours, certified", "ours, certified, 2 seeds"]
+    assert all(float(cell.replace(",", "")) > 0 for row in training for cell in row[3:5] + row[6:])
+    assert [row[:3] for row in parts] == [["250", "3", "default"], ["100", "3", "experiment=paper"]]
+    for row in parts:  # the parts are the whole
+        total = sum(float(cell.split()[0]) for cell in row[4:-1])
+        assert total == pytest.approx(float(row[3]), rel=0.01, abs=0.1)
