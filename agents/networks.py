@@ -16,9 +16,8 @@ JOINT_ACTION = ("agents", "joint_action")
 STATE_ACTION_VALUE = ("agents", "state_action_value")
 
 
-Layers = list[
-    tuple[Tensor, Tensor]
-]  # weight and bias, layer by layer; a leading dimension (K, N, K N) for several networks
+Layers = list[tuple[Tensor, Tensor]]
+"""Weight and bias, layer by layer; with a leading dimension (N robots, K learners, or both) for several networks."""
 
 
 class BatchedMLP(MultiAgentMLP):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from agents.adversary_reward import BARRIERS, AdversaryReward
 from agents.config import AgentConfig
@@ -207,7 +208,7 @@ class Config:
     @property
     def all_seeds(self) -> list[int]:
         """The seeds that this program trains."""
-        return list(self.seeds) if self.seeds is not None else [self.seed + k for k in range(self.n_seeds)]
+        return seeds_of(self)
 
     def _check_seeds(self) -> None:
         check_range("n_seeds", self.n_seeds, 1, MOST_SEEDS)
@@ -233,6 +234,13 @@ class Config:
         if self.train.objective == "coverage":
             return None
         return AdversaryReward(self.env, self.safety, self.train.attack)
+
+
+def seeds_of(config: Any) -> list[int]:
+    """Seeds of a configuration, composed (perhaps not yet checked) or :class:`Config`."""
+    if config.seeds:
+        return list(config.seeds)
+    return [config.seed + k for k in range(max(1, config.n_seeds))]
 
 
 def check_common(seed: int, device: str, threads: int) -> None:

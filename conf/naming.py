@@ -8,6 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from agents.evaluation import rollout_steps
+from agents.training_config import seeds_of
 
 # Settings that do not change what is computed by a run of a given seed.
 NOT_HASHED = (
@@ -55,13 +56,6 @@ def program_name(cfg: DictConfig) -> str:
         label = "_".join(map(str, seeds))
         label = label if len(label) < 40 else f"{len(seeds)}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
     return f"{config_hash(cfg)}_seeds{label}"
-
-
-def seeds_of(cfg: DictConfig) -> list[int]:
-    """Seeds of a composed, not yet checked configuration of train.py."""
-    if cfg.seeds:
-        return list(cfg.seeds)
-    return [cfg.seed + k for k in range(max(1, cfg.n_seeds))]
 
 
 def _plain(cfg: DictConfig, name: str) -> Any:

@@ -8,7 +8,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tqdm import tqdm
 
-from conf.naming import config_hash, program_name, run_name, seeds_of
+from agents.training_config import seeds_of
+from conf.naming import config_hash, program_name, run_name
 from envs import SurveillanceConfig
 from envs.inequalities import derived_quantities
 

@@ -26,9 +26,9 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from agents.interruption import STOP_FILE, InterruptedRunError
+from agents.training_config import seeds_of
 from conf.job_log import LOG, FailedRunError, read_failure
 from conf.launching import SweepError, check_launcher, is_broken_pool, patient, replaced
-from conf.naming import seeds_of
 from conf.run_folder import finished_run, foreign_run, objective, run_folders
 from conf.sweep_jobs import FAILED_JOBS, FailedJob, Job, is_listed, list_jobs, refuse_shared_folders
 
