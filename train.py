@@ -15,11 +15,12 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
+from agents.collection import make_collection, seeds_of_streams
 from agents.interruption import StopSignals
 from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import ExplorationNoise, make_policies
-from agents.pipeline import MultiStep, collect, pick_device, to_transitions, use_threads
+from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds
 from agents.run import (
     FAILURES,
@@ -30,7 +31,6 @@ from agents.run import (
     errors_by_seed,
     for_each,
     minibatch,
-    seeds_of_streams,
     shares,
     stopped_at,
 )
@@ -75,15 +75,14 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
     device = pick_device(config.device)
     use_threads(config.threads, deterministic=config.deterministic)
-    streams = [seeds_of_streams(seed) for seed in folders]
-    env_seeds, noise_seeds = [own[0] for own in streams], [own[1] for own in streams]
-    num_envs, world, safety = config.collector.num_envs, config.env, config.safety
-    env = SurveillanceEnv(world, len(folders) * num_envs, device, seed=env_seeds, compile_functions=config.compile)
+    world, safety, seeds = config.env, config.safety, list(folders)
+    noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
     eval_env = SurveillanceEnv(world, config.eval.num_envs, device, compile_functions=config.compile)
-    learners, learner = make_learners(env.n_observation, world, config.agent, safety, device, seeds=list(folders))
+    learners, learner = make_learners(eval_env.n_observation, world, config.agent, safety, device, seeds=seeds)
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
     (_, safety_filter), explore_policy = policies
     noises = [module for module in explore_policy.modules() if isinstance(module, ExplorationNoise)]  # one per seed
+    collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
     adversary = config.adversary_reward()
     seconds.watch("policy", explore_policy)
@@ -93,7 +92,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
         TrainingRun(
             *(folder, config, seed, origin | {"seed": seed}, settings),
             learner=learners[k],
-            worlds=env.blocks[k],
+            worlds=collection.blocks[k],
             waiting=multi_step.blocks[k],
             noise=noises[k],
             policy=TensorDictSequential(learners[k].actor, safety_filter),
@@ -117,12 +116,12 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
 
     # ---- train: noise, then filter, then execution (explore_policy); the buffers hold executed and nominal actions
     losses: dict[str, torch.Tensor] = {}
-    n_runs, frames, per_batch = len(runs), config.collector.total_frames - start, config.collector.frames_per_batch
+    n_runs, frames = len(runs), config.collector.total_frames - start
     interval = 1.0 if sys.stderr.isatty() else 30.0  # a line now and then in a log file
     total = config.collector.total_frames * n_runs
     bar = tqdm(total=total, initial=start * n_runs, unit="frame", unit_scale=True, mininterval=interval)
     with StopSignals() as stop:
-        for batch in collect(env, explore_policy, per_batch * n_runs, frames * n_runs, resumed=start > 0):
+        for batch in collection.batches(frames * n_runs, resumed=start > 0):
             transitions = to_transitions(batch, config.train.violation_penalty, adversary)
             parts = (batch, multi_step(transitions), transitions["next"][keys.REWARD])
             for_each(runs, TrainingRun.take, *(shares(part, runs) for part in parts))

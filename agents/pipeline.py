@@ -21,6 +21,12 @@ STORED = (
     *(("next", *key) for key in (keys.REWARD, keys.DONE, keys.TERMINATED)),
     ("next", "done"),
 )
+COLLECTOR_OPTIONS = {
+    "split_trajs": False,
+    "track_traj_ids": False,
+    "trust_policy": True,
+    "auto_register_policy_transforms": False,  # the noise reads the world's own step count
+}
 STEPS = "steps_to_next_obs"  # TorchRL's name for the length of an n-step transition
 
 
@@ -84,10 +90,7 @@ def collect(
         frames_per_batch=frames_per_batch,
         total_frames=frames,
         device=env.device,
-        split_trajs=False,
-        track_traj_ids=False,
-        trust_policy=True,
-        auto_register_policy_transforms=False,  # the noise reads the world's own step count
+        **COLLECTOR_OPTIONS,
     )
     if resumed:  # a new collector tries its policy once, which draws noise; the first one's trial is part of the stream
         policy.load_state_dict(noise_state)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from agents.board import Board
 from agents.checkpoint import CheckpointError, world_sizes
+from agents.collection import Block, WorkerBlock, seeds_of_streams
 from agents.divergence import DivergedError, check_batch, check_finite, check_weights
 from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
@@ -23,7 +24,6 @@ from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_config import Config
 from agents.training_state import TrainingState, valid_ages
 from envs import SurveillanceEnv, keys
-from envs.blocks import WorldBlock
 from envs.rendering import save_training_curve
 
 FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
@@ -47,11 +47,6 @@ class SeedsFailedError(RuntimeError):
         seeds = ", ".join(map(str, self.errors))
         first, error = next(iter(self.errors.items()))
         return f"{len(self.errors)} of {len(self.errors) + self.others} seeds failed: {seeds}.\nseed {first}: {error}"
-
-
-def seeds_of_streams(seed: int) -> list[int]:
-    """Seeds of a run's own random streams: worlds, noise, replay sampling, evaluation."""
-    return np.random.SeedSequence(seed).generate_state(4).tolist()
 
 
 class TrainingRun:
@@ -81,7 +76,7 @@ class TrainingRun:
         settings: dict,
         *,
         learner: Learner,
-        worlds: WorldBlock,
+        worlds: Block,
         waiting: WaitingSteps,
         noise: ExplorationNoise,
         policy: TensorDictSequential,
@@ -89,7 +84,7 @@ class TrainingRun:
         seconds: Seconds,
     ) -> None:
         self.folder, self.config, self.seed, self.origin, self.settings = folder, config, seed, origin, settings
-        self.learner, self.noise, self.policy, self.eval_env = learner, noise, policy, eval_env
+        self.worlds, self.learner, self.noise, self.policy, self.eval_env = worlds, learner, noise, policy, eval_env
         self.error: Exception | None = None
         """What ended the run before its time, where it shares its program with others."""
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
@@ -235,6 +230,7 @@ class TrainingRun:
         wall_time, frames = seconds.total(), self.recorder.frames
         speed = {"wall_time_s": wall_time, "frames_per_second": frames / wall_time, "time": seconds.totals}
         speed |= {"n_seeds": n_seeds} if n_seeds > 1 else {}
+        speed |= {"workers_lost": self.worlds.lost} if isinstance(self.worlds, WorkerBlock) else {}
         kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}}
         return self.origin | self.recorder.summary() | speed | kept | {"eval": self.recorder.evaluation}
 

@@ -1,5 +1,7 @@
 """Typed configuration of a training run and its checks."""
 
+import importlib.util
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,42 @@ class CollectorConfig:
     def frames_per_batch(self) -> int:
         """World-steps per collected batch."""
         return self.num_envs * self.steps_per_batch
+
+
+@dataclass
+class WorkersConfig:
+    """Processes that collect beside the learner, on this machine or a Ray cluster."""
+
+    count: int = 0
+    """Workers, 0..1000; 0 = the learner collects itself. Each steps its part of the collector.num_envs worlds of every seed,
+    with random streams of its own: another number gives other results. One that dies is started anew and repeats the batch."""
+    overlap: bool = True
+    """Collect the next batch while the learner updates, with the policy of one batch before; false: one after the other."""
+    backend: str = "processes"
+    """processes: of this machine. ray: actors of a Ray cluster (needs the extra ray)."""
+    ray_address: str | None = None
+    """Of a running Ray cluster, auto or <host>:<port>; null = start one on this machine."""
+    gpus: float = 0.0
+    """ray: share of a GPU for each worker, 0..8; 0 = the workers compute on CPUs."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        check_range("workers.count", self.count, 0, 1000)
+        check_choice("workers.backend", self.backend, ("processes", "ray"))
+        check_range("workers.gpus", self.gpus, 0, 8)
+        if self.backend == "ray" and importlib.util.find_spec("ray") is None:
+            raise ValueError(
+                "workers.backend=ray needs the package ray, which is not installed: pip install -c constraints-extras.txt -e "
+                "'.[ray]', or take workers.backend=processes."
+            )
+        if self.backend != "ray" and (self.ray_address is not None or self.gpus):
+            given = f"workers.gpus={self.gpus:g}" if self.gpus else f"workers.ray_address={self.ray_address}"
+            raise ValueError(f"{given} is for workers.backend=ray: add that, or leave it out.")
+        if self.ray_address is not None and not re.fullmatch(r"auto|(\[[^]]+\]|[^:/]+):\d+", self.ray_address):
+            raise ValueError(
+                f"workers.ray_address={self.ray_address} is no address of a Ray cluster: auto or <host>:<port>, such as "
+                "10.0.0.1:6379; null starts one on this machine."
+            )
 
 
 @dataclass
@@ -179,6 +217,7 @@ class Config:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
+    workers: WorkersConfig = field(default_factory=WorkersConfig)
     buffer: BufferConfig = field(default_factory=BufferConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
@@ -193,6 +232,11 @@ class Config:
             raise ValueError(
                 f"resume={self.resume} is neither auto nor never, and no such file or folder exists: give a checkpoint "
                 "(<run folder>/checkpoints/frames_*.pt) or a run's folder."
+            )
+        if self.workers.count and self.collector.num_envs % self.workers.count:
+            raise ValueError(
+                f"collector.num_envs={self.collector.num_envs} is not a multiple of workers.count={self.workers.count}: each "
+                "worker steps as many worlds as the others."
             )
         self.safety.gains(self.env)
         check_loss(self.agent, self.safety)

@@ -87,25 +87,48 @@ def check_launcher(name: str, launcher: DictConfig) -> None:
                 "cluster. Start the sweep on one, or take hydra/launcher=local. Nothing was started."
             )
     if target.endswith("RayLauncher"):
-        address = OmegaConf.select(launcher, "ray.init.address") or ""
-        if match := re.fullmatch(r"(ray://)?(\[[^]]+\]|[^:/]+):(\d+)", str(address)):
-            _reach(name, match.group(2).strip("[]"), int(match.group(3)), client=bool(match.group(1)))
+        try:
+            reach_ray(str(OmegaConf.select(launcher, "ray.init.address") or "local"), "hydra.launcher.ray.init.address")
+        except ConnectionError as error:
+            raise SweepError(f"hydra/launcher={name}: {error}") from error
 
 
-def _reach(name: str, host: str, port: int, client: bool) -> None:
-    """Ray itself would try for minutes."""
+def reach_ray(address: str, option: str) -> None:
+    """Refuse a Ray cluster that does not answer; Ray itself would try for minutes.
+
+    Args:
+        address: ``<host>:<port>``, also with ray:// before it, ``auto``, or ``local`` for one that is yet to start.
+        option: that names it, for the message.
+
+    Raises:
+        ConnectionError: saying why, and what to do.
+    """
+    found = re.fullmatch(r"(ray://)?(\[[^]]+\]|[^:/]+):(\d+)", address)
+    if address != "auto" and not found:
+        return
+    check = [sys.executable, "-m", "ray.scripts.scripts", "health-check"]
+    why = None
     try:
-        socket.create_connection((host, port), timeout=REACH_SECONDS).close()
-        if not client:  # somebody answers: is it Ray?
-            command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", f"{host}:{port}"]
-            # whatever it finds, it finds at once: only what is no Ray keeps it waiting
-            subprocess.run(command, timeout=4 * REACH_SECONDS, capture_output=True, check=False)
-    except (OSError, OverflowError, subprocess.TimeoutExpired) as error:
-        why = "no Ray there" if isinstance(error, subprocess.TimeoutExpired) else error
-        raise SweepError(
-            f"hydra/launcher={name}: the Ray cluster at {host}:{port} does not answer ({why}). Start its head node (ray start "
-            "--head), correct hydra.launcher.ray.init.address, or leave it out for a cluster on this machine. Nothing was started."
-        ) from error
+        if found is None:
+            missing = subprocess.run(check, timeout=4 * REACH_SECONDS, capture_output=True, check=False).returncode
+            why = "none runs on this machine" if missing else None
+        else:
+            host, port = found.group(2).strip("[]"), int(found.group(3))
+            socket.create_connection((host, port), timeout=REACH_SECONDS).close()
+            if not found.group(
+                1
+            ):  # somebody answers: is it Ray? What the check finds, it finds at once: others keep it waiting
+                check += ["--address", f"{host}:{port}"]
+                subprocess.run(check, timeout=4 * REACH_SECONDS, capture_output=True, check=False)
+    except (OSError, OverflowError) as error:
+        why = str(error)
+    except subprocess.TimeoutExpired:
+        why = "no Ray there"
+    if why:
+        raise ConnectionError(
+            f"the Ray cluster at {address.removeprefix('ray://')} does not answer ({why}). Start its head node (ray start --head), "
+            f"correct {option}, or leave it out for a cluster on this machine. Nothing was started."
+        )
 
 
 @contextlib.contextmanager

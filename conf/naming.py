@@ -36,8 +36,11 @@ def config_hash(cfg: DictConfig) -> str:
 
 
 def hashed_config(cfg: DictConfig) -> dict:
-    """The resolved configuration without :data:`NOT_HASHED`, nested."""
-    return {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
+    """The resolved configuration without :data:`NOT_HASHED`, nested; workers only where there are some."""
+    found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
+    workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
+    kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
+    return found | kept
 
 
 def run_name(cfg: DictConfig, seed: int) -> str:

@@ -13,7 +13,7 @@ from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, wor
 from agents.training_config import Config
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig
-from conf.launching import register_resolvers
+from conf.launching import reach_ray, register_resolvers
 from conf.manual import check_names, groups, manual
 from conf.naming import GROUPS, config_hash, evaluation_folder, hashed_config, program_name
 from conf.report_schema import ReportConfig
@@ -75,6 +75,8 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
 def check_training(cfg: DictConfig) -> None:
     """Raise what is wrong with a training run before anything is written: values, and the checkpoint that resume names."""
     config: Config = to_config(cfg)
+    if config.workers.count and config.workers.ray_address is not None:
+        reach_ray(config.workers.ray_address, "workers.ray_address")
     if config.resume not in ("auto", "never"):
         path, content = named_checkpoint(Path(config.resume), tell=lambda line: None)
         own = path.parent.parent.resolve() == Path(str(cfg.hydra.run.dir)).resolve()

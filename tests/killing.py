@@ -50,7 +50,8 @@ def start(
     Args:
         folder: the run's folder.
         arguments: overrides.
-        stage: one of :data:`STAGES`, or "in training" (a batch): the process sends itself a signal there.
+        stage: one of :data:`STAGES`, or "in training" (a batch): the process sends itself a signal there;
+            "in a worker", "in a Ray worker": it sends one of its workers a signal at a batch.
         count: the how many-th time it gets there.
         limit: bytes that a file may have; 0 = no limit.
         by: the signal.
@@ -142,6 +143,11 @@ def _arm(stage: str, count: int, by: int) -> None:
 
     def patched_update(self, batch, update=TrainingRecorder.update):
         die(stage == "in training")
+        if stage in ("in a worker", "in a Ray worker"):
+            nonlocal left
+            left -= 1
+            if not left:
+                os.kill(_worker_of_ray() if "Ray" in stage else multiprocessing.active_children()[0].pid, by)
         update(self, batch)
 
     TrainingRecorder.update = patched_update
@@ -159,6 +165,11 @@ def _arm(stage: str, count: int, by: int) -> None:
             write(self, data)
 
         RecordWriter.write = patched_write
+
+
+def _worker_of_ray() -> int:
+    titles = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline")}
+    return max(pid for pid, title in titles.items() if title.startswith(b"ray::WorldsCollector"))
 
 
 def result(folder: Path) -> dict:
