@@ -1,4 +1,4 @@
-"""Where a training run's batches come from: worlds of this process, or of workers (:mod:`agents.workers`)."""
+"""Where a training run's batches come from: worlds of this process, or of workers (:mod:`agents.worker_pools`)."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -13,19 +13,8 @@ from agents.learners import Learner
 from agents.networks import ExplorationNoise
 from agents.pipeline import collect
 from agents.training_config import Config
-from agents.workers import (
-    Pool,
-    ProcessPool,
-    RayPool,
-    Weights,
-    WorkerLostError,
-    WorkerTask,
-    copied,
-    dumps,
-    loads,
-    unflat,
-    weights_of,
-)
+from agents.worker_pools import Pool, ProcessPool, RayPool, WorkerLostError
+from agents.workers import Weights, WorkerTask, copied, dumps, loads, unflat, weights_of
 from envs import SurveillanceEnv
 
 MOST_LOSSES = 3

@@ -45,14 +45,19 @@ def cores() -> int:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def register_resolvers() -> None:
-    """``${cores:<threads>}``: cores of a run with so many threads, 0 = all of them; ``${runs_at_once:<threads>}``.
+def cores_of_run(threads: int, workers: int = 0) -> int:
+    """CPU cores that a run with so many threads (0: all cores) and workers uses."""
+    return (int(threads) or cores()) * (1 + int(workers))
 
-    ``${cores_of_cluster:<address>}``: those of a Ray cluster that is started here; null for one that runs already.
+
+def register_resolvers() -> None:
+    """``${cores_of_run:<threads>,<workers>}``, and ``${runs_at_once:<threads>,<workers>}`` of them on this machine.
+
+    ``${cores_of_cluster:<address>}``: cores of a Ray cluster that is started here; null for one that runs already.
     """
-    OmegaConf.register_new_resolver("cores", lambda threads: int(threads) or cores(), replace=True)
+    OmegaConf.register_new_resolver("cores_of_run", cores_of_run, replace=True)
     OmegaConf.register_new_resolver(
-        "runs_at_once", lambda threads: max(1, cores() // (int(threads) or cores())), replace=True
+        "runs_at_once", lambda threads, workers=0: max(1, cores() // cores_of_run(threads, workers)), replace=True
     )
     OmegaConf.register_new_resolver(
         "cores_of_cluster", lambda address: cores() if address in (None, "local") else None, replace=True

@@ -101,6 +101,15 @@ def test_many_seeds_against_single_runs(load, capsys):
     assert all(float(cell) > 0 for row in rows for cell in row)
 
 
+def test_collection_by_workers(load, capsys):
+    sizes = ["--worlds", "8", "--workers", "1", "--seconds", "0", "--repeats", "1"]
+    load("bench_workers").main([*sizes, "buffer.capacity=5000", "buffer.batch_size=8"])
+    out = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in out.splitlines() if line.startswith("| 8")]
+    assert [row[1] for row in rows] == ["no workers", "1, in turn", "1, overlap"]
+    assert all(float(cell.replace(",", "")) > 0 for row in rows for cell in row[2:])
+
+
 def test_training_against_torchrl(load, capsys):
     pytest.importorskip("vmas")
     sizes = ["--worlds", "8", "--steps", "2", "--repeats", "1", "--seeds", "2"]

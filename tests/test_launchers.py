@@ -310,6 +310,8 @@ def test_runs_at_once(monkeypatch):
     monkeypatch.setattr(launching, "cores", lambda: 8)
     for threads, runs in ((1, 8), (2, 4), (3, 2), (16, 1), (0, 1)):
         assert launcher_settings("local", f"threads={threads}").n_jobs == runs
+    assert launcher_settings("local", "threads=2", "workers.count=1").n_jobs == 2
+    assert launcher_settings("slurm", "threads=2", "workers.count=3").cpus_per_task == 8
 
 
 def test_slurm_asks_for_what_was_given(monkeypatch, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 import train
 from agents import collection
-from agents.workers import WorkerLostError
+from agents.worker_pools import WorkerLostError
 from tests.killing import RUN, differences, result, run
 
 pytestmark = pytest.mark.xdist_group("workers")  # its fixtures are made once, not by every worker

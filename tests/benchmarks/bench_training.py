@@ -48,12 +48,13 @@ from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor, TanhDelt
 from torchrl.modules.models.multiagent import MultiAgentMLP
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
+from agents.collection import make_collection
 from agents.divergence import check_batch
 from agents.incident import check_violations
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import make_policies
-from agents.pipeline import MultiStep, collect, make_buffer, to_transitions, use_threads
+from agents.networks import ExplorationNoise, make_policies
+from agents.pipeline import MultiStep, make_buffer, to_transitions, use_threads
 from agents.recorder import Seconds, TrainingRecorder
 from agents.training_config import Config
 from conf.schema import register, to_config
@@ -214,9 +215,11 @@ def baseline(config: Config, steps: int) -> Contestant:
 def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     """The loop of train.py, and the clock that watches the parts of its collection."""
     seeds, device, worlds = list(range(n_seeds)), torch.device("cpu"), config.collector.num_envs
-    env = SurveillanceEnv(config.env, n_seeds * worlds, device, seed=seeds)
-    _, learner = make_learners(env.n_observation, config.env, config.agent, config.safety, device, seeds=seeds)
+    n_observation = SurveillanceEnv(config.env).n_observation
+    learners, learner = make_learners(n_observation, config.env, config.agent, config.safety, device, seeds=seeds)
     _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, seeds, device)
+    noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
+    collection = make_collection(config, seeds, learners, explore, noises, device, print)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
     minibatch = config.buffer.batch_size
     buffers = [make_buffer(config.buffer.capacity, minibatch, device, seed) for seed in seeds]
@@ -244,7 +247,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
         return samples[0] if n_seeds == 1 else torch.stack(samples)
 
     per_batch, updates = n_seeds * config.collector.frames_per_batch, config.train.n_updates
-    batches = collect(env, explore, per_batch, -1)
+    batches = collection.batches(10**6 * per_batch, resumed=False)
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
         store(next(batches))
 
