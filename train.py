@@ -30,7 +30,7 @@ from agents.run import (
     equally_far,
     errors_by_seed,
     for_each,
-    minibatch,
+    minibatches,
     shares,
     stopped_at,
 )
@@ -127,8 +127,8 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             for_each(runs, TrainingRun.take, *(shares(part, runs) for part in parts))
             seconds.spent("collect")
             if any(run.learns for run in runs):
-                for _ in range(config.train.n_updates):
-                    losses = update_step(minibatch(runs), *learner.updates, config.agent)
+                for minibatch in minibatches(runs, config.train.n_updates):
+                    losses = update_step(minibatch, *learner.updates, config.agent)
             seconds.spent("update")
             for_each(runs, TrainingRun.log, [losses] * n_runs, [seconds] * n_runs, range(n_runs))
             bar.set_postfix_str(runs[0].progress, refresh=False)

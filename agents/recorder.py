@@ -133,18 +133,18 @@ class TrainingRecorder:
     def update(self, batch: TensorDictBase) -> None:
         """Take in a collected batch ``(num_envs, T)``."""
         following = batch["next"]
-        flags = {kind: following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS}
-        for kind, flag in flags.items():
-            count = int(flag.sum())
-            self.violations[kind] += count
-            self._violations_recent[kind] += count
-        violating = (
-            torch.stack(list(flags.values())).any(dim=0).sum(-1)
-        )  # robot-steps: a robot may violate twice at once
+        flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
+        sums = torch.stack([*(flag.sum().double() for flag in flags), following[keys.COVERAGE_COST].sum().double()])
+        *counts, cost = sums.tolist()
+        for kind, count in zip(keys.VIOLATION_KINDS, counts, strict=True):
+            self.violations[kind] += int(count)
+            self._violations_recent[kind] += int(count)
+        violating = torch.stack(flags).any(dim=0).sum(-1)  # robot-steps: a robot may violate twice at once
         self.episodes.update(following[keys.REWARD][..., 0, 0], violating, following["done"].squeeze(-1))
-        self.filter.update(batch)
-        self._recent.update(batch)
-        self._cost[0] += float(following[keys.COVERAGE_COST].sum())
+        found = self.filter.measure(batch)
+        self.filter.add(found)
+        self._recent.add(found)
+        self._cost[0] += cost
         self._cost[1] += batch.numel()
         self.frames += batch.numel()
 

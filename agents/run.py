@@ -2,7 +2,7 @@
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,8 @@ from envs.rendering import save_training_curve
 
 FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
 """What ends one seed's run and not the others' of its program."""
+MOST_AT_ONCE = 16
+"""Minibatches that are drawn at a time."""
 
 
 class SeedsFailedError(RuntimeError):
@@ -89,8 +91,8 @@ class TrainingRun:
         """What ended the run before its time, where it shares its program with others."""
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
         device, agent = eval_env.device, config.agent
-        minibatches = config.env.n_agents if agent.minibatch == "per_agent" else 1
-        self.buffer = make_buffer(config.buffer.capacity, config.buffer.batch_size * minibatches, device, buffer_seed)
+        self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
+        self.buffer = make_buffer(config.buffer.capacity, self.batch_size, device, buffer_seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),
@@ -302,13 +304,20 @@ def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequen
     return rows.chunk(len(runs)) if len(rows) else [rows] * len(runs)
 
 
-def minibatch(runs: Sequence[TrainingRun]) -> TensorDictBase:
-    """Transitions for one update: ``(batch,)`` of the only run, ``(K, batch)`` of several."""
-    if len(runs) == 1:
-        return runs[0].buffer.sample()
-    samples = [run.buffer.sample() if run.error is None else None for run in runs]
-    stand_in = next(sample for sample in samples if sample is not None)  # for failed runs, whose networks are lost
-    return torch.stack([stand_in if sample is None else sample for sample in samples])  # pyright: ignore[reportReturnType]
+def minibatches(runs: Sequence[TrainingRun], count: int) -> Iterator[TensorDictBase]:
+    """Transitions for so many updates: ``(batch,)`` each of the only run, ``(K, batch)`` of several."""
+    for first in range(0, count, MOST_AT_ONCE):
+        some = min(MOST_AT_ONCE, count - first)
+        samples = [_sample(run, some) if run.error is None else None for run in runs]
+        stand_in = next(sample for sample in samples if sample is not None)  # for failed runs, whose networks are lost
+        parts = [stand_in if sample is None else sample for sample in samples]
+        for rows in zip(*parts, strict=True):
+            yield rows[0] if len(runs) == 1 else torch.stack(rows)  # pyright: ignore[reportReturnType, reportCallIssue]
+
+
+def _sample(run: TrainingRun, count: int) -> Sequence[TensorDictBase]:
+    """``count`` minibatches, drawn as one: the same as one after the other, in less time."""
+    return run.buffer.sample(count * run.batch_size).chunk(count)
 
 
 def errors_by_seed(error: Exception, seeds: Iterable[int]) -> dict[int, str]:

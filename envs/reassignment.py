@@ -37,7 +37,7 @@ def best_exchanges(
     affordable = energy.unsqueeze(-1) - geometry.energy_min - 2 * geometry.eps_energy >= reserve(way, geometry)
     cost = torch.where(affordable, way.square(), torch.inf)
     own_way = way.gather(-1, slot.unsqueeze(-1)).square()  # (*B, N, 1)
-    owner = torch.nn.functional.one_hot(slot, n_slots).to(way.dtype)  # robot j owns slot s
+    owner = (slot.unsqueeze(-1) == torch.arange(n_slots, device=slot.device)).to(way.dtype)  # robot j owns slot s
     taken = owner.sum(dim=-2, keepdim=True) > 0  # (*B, 1, S)
     # cost of slot s's owner j in robot i's slot: cross[i, s] = cost[j(s), slot_i], 0 for a free slot
     in_slot_of = cost.gather(-1, slot.unsqueeze(-2).expand(*slot.shape, slot.shape[-1]))  # robot j in robot i's slot

@@ -177,7 +177,8 @@ def _solve_flat(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float
     p, G, h = p.double(), G.double(), h.double()
     index, count = None, len(p)
     # A sum is finite only if all its terms are, and ten times cheaper than asking each.
-    if not all(bool(x.sum().isfinite()) for x in (Q, p, G) if x is not None) or not bool((h > -torch.inf).all()):
+    sums = [x.sum().isfinite() for x in (Q, p, G) if x is not None]
+    if not bool(torch.stack([*sums, (h > -torch.inf).all()]).all()):
         good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
         if Q is not None:
             good = good & Q.isfinite().all(-1).all(-1)

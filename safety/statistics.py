@@ -51,6 +51,10 @@ class FilterStatistics:
             tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``.
             alive: ``(*B, 1)`` bool, worlds that count; all if not given.
         """
+        self.add(self.measure(tensordict, alive))
+
+    def measure(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, float]:
+        """What :meth:`add` takes of filter outputs, as :meth:`update`'s; waits for the device once."""
         status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
         correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
         counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
@@ -64,18 +68,22 @@ class FilterStatistics:
             counts & tensordict[keys.OUTSIDE],
             counts & (level == HOMING),
         )
-        totals = torch.stack([row.sum(dtype=torch.float64) for row in rows])
-        largest = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max()
-        for name, total in zip(self.sums, totals.tolist(), strict=True):
-            self.sums[name] += total
-        self.max_residual = max(self.max_residual, float(largest))
-        found = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
-        found = {
-            name: torch.where(counts, x.squeeze(-1), torch.inf).min() for name, x in found.items() if x is not None
-        }
-        if found:
-            for name, value in zip(found, torch.stack(list(found.values())).tolist(), strict=True):
-                self.least[name] = min(self.least.get(name, math.inf), value)
+        found = dict(zip(self.sums, (row.sum(dtype=torch.float64) for row in rows), strict=True))
+        found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
+        margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
+        for name, x in margins.items():
+            if x is not None:
+                found[name] = torch.where(counts, x.squeeze(-1), torch.inf).min().double()
+        return dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))
+
+    def add(self, found: dict[str, float]) -> None:
+        """Add what :meth:`measure` found."""
+        for name in self.sums:
+            self.sums[name] += found[name]
+        self.max_residual = max(self.max_residual, found["max_residual"])
+        for name in MARGINS:
+            if name in found:
+                self.least[name] = min(self.least.get(name, math.inf), found[name])
 
     def summary(self) -> dict[str, float]:
         """Rates per robot-step, counts in robot-steps, mean correction in m/s, largest residual of an executed solution, and

@@ -242,11 +242,16 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
             for buffer, own in zip(buffers, steps.chunk(n_seeds), strict=True):
                 buffer.extend(own)
 
-    def sample() -> TensorDictBase:
-        samples = [buffer.sample() for buffer in buffers]
-        return samples[0] if n_seeds == 1 else torch.stack(samples)
-
     per_batch, updates = n_seeds * config.collector.frames_per_batch, config.train.n_updates
+    drawn: list[tuple[TensorDictBase, ...]] = []
+
+    def sample() -> TensorDictBase:
+        if not drawn:  # all of a batch at once, as agents.run.minibatches
+            samples = [buffer.sample(updates * minibatch).chunk(updates) for buffer in buffers]
+            drawn.extend(reversed(list(zip(*samples, strict=True))))
+        rows = drawn.pop()
+        return rows[0] if n_seeds == 1 else torch.stack(rows)
+
     batches = collection.batches(10**6 * per_batch, resumed=False)
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
         store(next(batches))

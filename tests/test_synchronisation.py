@@ -1,0 +1,94 @@
+"""How often an iteration of training waits for the device: as often whatever the number of worlds and robots.
+
+On a GPU an operation whose result the host needs (a Python number, a size that depends on the data) waits until the queue is
+empty. Here a CPU counts them, where they cost nothing.
+"""
+
+from collections import Counter
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from agents.collection import make_collection
+from agents.learners import make_learners
+from agents.maddpg import update_step
+from agents.networks import ExplorationNoise, make_policies
+from agents.pipeline import MultiStep, make_buffer, to_transitions
+from agents.recorder import TrainingRecorder
+from agents.training_config import Config
+from envs import SurveillanceConfig, SurveillanceEnv
+
+CPU = torch.device("cpu")
+ATEN = torch.ops.aten
+WAITS = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal, ATEN.repeat_interleave, ATEN._unique2}
+INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
+MOST = {"collect": 18, "count": 5, "store": 1, "update": 0}
+"""Waits of an iteration without resets. Of collecting, two are TorchRL's (is any world done?), the others select the worlds,
+pairs and rows that the filter and the reassignment of slots have to look at."""
+
+
+class Waits(TorchDispatchMode):
+    """Counts operations that wait for a GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found = Counter()
+        self.on_host: dict[int, torch.Tensor] = {}
+        """By id: the optimisers' counts of steps, which stay on the host."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        packet = func.overloadpacket
+        masked = packet in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
+        if (packet in WAITS or masked) and id(args[0]) not in self.on_host:
+            self.found[str(packet)] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def waits(world: SurveillanceConfig, num_envs: int) -> dict[str, float]:
+    """Waits per iteration of each part of the training loop."""
+    config = Config(env=world)
+    config.collector.num_envs = num_envs
+    learners, learner = make_learners(
+        SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=[0]
+    )
+    _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU)
+    noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
+    collection = make_collection(config, [0], learners, explore, noises, CPU, print)
+    batches = collection.batches(100 * num_envs, resumed=False)
+    multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, 256, CPU, 0)
+    recorder, counts = TrainingRecorder(world, num_envs, CPU), dict.fromkeys(MOST, 0.0)
+    mode = Waits()
+    for k in range(20):
+        before = Counter(mode.found)
+
+        def spent(part: str, k: int = k) -> None:
+            nonlocal before
+            if k >= 10:  # the multi-step window is full, the optimisers have begun
+                counts[part] += sum((mode.found - before).values()) / 10
+            before = Counter(mode.found)
+
+        with mode:
+            batch = next(batches)
+            spent("collect")
+            recorder.update(batch)
+            spent("count")
+            steps = multi_step(to_transitions(batch))
+            if len(steps):
+                buffer.extend(steps)
+            spent("store")
+        if k >= 8:
+            minibatch = buffer.sample()
+            with mode:
+                update_step(minibatch, *learner.updates, config.agent)
+            spent("update")
+            steps = [state["step"] for own in learner.optimizers.values() for state in own.state.values()]
+            mode.on_host = {id(step): step for step in steps}
+    return counts
+
+
+@pytest.mark.parametrize(("n_agents", "num_envs"), [(3, 64), (3, 256), (6, 64)])
+def test_waits_of_an_iteration(n_agents, num_envs):
+    found = waits(SurveillanceConfig(n_agents=n_agents, horizon=100), num_envs)
+    assert all(found[part] <= most for part, most in MOST.items()), found
+    assert found["collect"] > 5  # the counting counts
