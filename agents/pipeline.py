@@ -100,12 +100,10 @@ def collect(
         collector.shutdown()
 
 
-def make_buffer(capacity: int, batch_size: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
+def make_buffer(capacity: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
     """Uniform replay with its own generator. It holds the executed action and every key that the filter reads."""
     generator = torch.Generator().manual_seed(seed)
-    return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, device=device), batch_size=batch_size, generator=generator
-    )
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity, device=device), generator=generator)
 
 
 def to_transitions(

@@ -92,7 +92,7 @@ class TrainingRun:
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
         device, agent = eval_env.device, config.agent
         self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
-        self.buffer = make_buffer(config.buffer.capacity, self.batch_size, device, buffer_seed)
+        self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),

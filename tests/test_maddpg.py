@@ -570,8 +570,8 @@ def test_buffer_samples_by_its_own_seed():
     samples = []
     for seed in (3, 3, 4):
         torch.manual_seed(seed + len(samples))
-        buffer = make_buffer(100, 16, torch.device("cpu"), seed)
+        buffer = make_buffer(100, torch.device("cpu"), seed)
         buffer.extend(data)
-        samples.append(buffer.sample()["x"])
+        samples.append(buffer.sample(16)["x"])
     assert torch.equal(samples[0], samples[1])
     assert not torch.equal(samples[0], samples[2])

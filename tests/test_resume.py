@@ -239,19 +239,19 @@ def test_rows_of_a_ring_buffer_come_back(tmp_path):
     draw = random.Random(1)
     for capacity in (1, 7, 40):
         folder = tmp_path / str(capacity)
-        buffer = make_buffer(capacity, 3, torch.device("cpu"), seed=0)
+        buffer = make_buffer(capacity, torch.device("cpu"), seed=0)
         files, written, states = ReplayFiles(folder, buffer), 0, []
         for _ in range(25):
             for _ in range(draw.randrange(3)):
                 count = draw.randint(1, min(6, capacity))
                 rows = {"a": torch.arange(written, written + count), ("next", "b"): torch.rand(count, 2)}
                 buffer.extend(TensorDict(rows, [count]))
-                buffer.sample()
+                buffer.sample(3)
                 written += count
             states.append(files.save())
             files.prune()
             for state in states[-2:]:
-                other = make_buffer(capacity, 3, torch.device("cpu"), seed=5)
+                other = make_buffer(capacity, torch.device("cpu"), seed=5)
                 source = shutil.copytree(folder, tmp_path / "copy") if folder.exists() else folder
                 ReplayFiles(folder, other).load(state, source)
                 shutil.rmtree(tmp_path / "copy", ignore_errors=True)

@@ -70,7 +70,7 @@ def waits(world: SurveillanceConfig, num_envs: int) -> dict[str, float]:
     noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
     collection = make_collection(config, [0], learners, explore, noises, CPU, print)
     batches = collection.batches(100 * num_envs, resumed=False)
-    multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, 256, CPU, 0)
+    multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, CPU, 0)
     recorder, counts = TrainingRecorder(world, num_envs, CPU), dict.fromkeys(MOST, 0.0)
     mode = Waits()
     readings = Readings(mode.found)
@@ -93,7 +93,7 @@ def waits(world: SurveillanceConfig, num_envs: int) -> dict[str, float]:
                 buffer.extend(steps)
             spent("store")
         if k >= 8:
-            minibatch = buffer.sample()
+            minibatch = buffer.sample(256)
             with mode, readings:
                 update_step(minibatch, *learner.updates, config.agent)
             spent("update")

@@ -222,7 +222,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     collection = make_collection(config, seeds, learners, explore, noises, device, print)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
     minibatch = config.buffer.batch_size
-    buffers = [make_buffer(config.buffer.capacity, minibatch, device, seed) for seed in seeds]
+    buffers = [make_buffer(config.buffer.capacity, device, seed) for seed in seeds]
     recorders = [TrainingRecorder(config.env, worlds, device) for _ in seeds]
     folder = Path(tempfile.gettempdir())  # of violation.json; a violation ends the program
     seconds = Seconds("collect")

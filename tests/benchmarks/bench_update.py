@@ -90,11 +90,11 @@ def training_rows(world: SurveillanceConfig, options, budget: harness.Budget) ->
         _, explore = make_policies(actor, world, safety, agent, 0, env.device)
         collector = collect(env, explore, frames, -1)
         collectors.append(collector)
-        buffer, batches = make_buffer(100_000, options.batches[0], env.device, 0), iter(collector)
+        buffer, batches = make_buffer(100_000, env.device, 0), iter(collector)
 
         def learn(batch: TensorDictBase, buffer=buffer, update=update) -> None:
             buffer.extend(to_transitions(batch).reshape(-1))
-            update(buffer.sample())
+            update(buffer.sample(options.batches[0]))
 
         chains[name] = (lambda batches=batches: next(batches), learn)
     times = budget.medians(chains, frames, ("training", world.n_agents))
