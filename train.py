@@ -6,6 +6,7 @@
 import json
 import logging
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import hydra
@@ -120,8 +121,8 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     interval = 1.0 if sys.stderr.isatty() else 30.0  # a line now and then in a log file
     total = config.collector.total_frames * n_runs
     bar = tqdm(total=total, initial=start * n_runs, unit="frame", unit_scale=True, mininterval=interval)
-    with StopSignals() as stop:
-        for batch in collection.batches(frames * n_runs, resumed=start > 0):
+    with StopSignals() as stop, closing(collection.batches(frames * n_runs, resumed=start > 0)) as batches:
+        for batch in batches:
             transitions = to_transitions(batch, config.train.violation_penalty, adversary)
             parts = (batch, multi_step(transitions), transitions["next"][keys.REWARD])
             for_each(runs, TrainingRun.take, *(shares(part, runs) for part in parts))

@@ -1,7 +1,7 @@
 """Where a training run's batches come from: worlds of this process, or of workers (:mod:`agents.worker_pools`)."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -41,7 +41,7 @@ class Collection(Protocol):
         """The worlds of each seed."""
         ...
 
-    def batches(self, frames: int, *, resumed: bool) -> Iterator[TensorDictBase]:
+    def batches(self, frames: int, *, resumed: bool) -> Generator[TensorDictBase, None, None]:
         """Batches ``(seeds * num_envs, T)`` until there are so many frames, each seed's worlds after the other's."""
         ...
 
@@ -125,7 +125,7 @@ class LocalCollection:
         self.policy = explore_policy
         self.frames_per_batch = config.collector.frames_per_batch * len(seeds)
 
-    def batches(self, frames: int, *, resumed: bool) -> Iterator[TensorDictBase]:
+    def batches(self, frames: int, *, resumed: bool) -> Generator[TensorDictBase, None, None]:
         """As :class:`Collection`."""
         return collect(self.env, self.policy, self.frames_per_batch, frames, resumed=resumed)
 
@@ -160,7 +160,7 @@ class WorkerCollection:
         self.blocks = [WorkerBlock() for _ in learners]
         self.count = config.workers.count
 
-    def batches(self, frames: int, *, resumed: bool) -> Iterator[TensorDictBase]:
+    def batches(self, frames: int, *, resumed: bool) -> Generator[TensorDictBase, None, None]:
         """As :class:`Collection`."""
         per_batch = self.config.collector.frames_per_batch * len(self.learners)
         if not frames:

@@ -3,7 +3,7 @@
 import contextlib
 import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import cast
 
 import torch
@@ -71,7 +71,7 @@ def use_threads(threads: int, *, deterministic: bool = False) -> None:
 
 def collect(
     env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, frames: int, *, resumed: bool = False
-) -> Iterator[TensorDictBase]:
+) -> Generator[TensorDictBase, None, None]:
     """Batches ``(num_envs, T)`` of TorchRL's collector; warm-up uses the policy, never the environment's random action.
 
     Args:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import make_controller
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
-from agents.training_config import Config
+from agents.training_config import Config, WorkersConfig
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig
 from conf.launching import reach_ray, register_resolvers
@@ -68,7 +68,10 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
         key = override.split("=")[0].lstrip("+~")
         if key.split(".")[0] in ("env", "safety"):
             OmegaConf.update(given, key, OmegaConf.select(cfg, key), merge=False)
-    given.device = cfg.device  # the run may have been trained elsewhere
+    given.device, given.workers = (
+        cfg.device,
+        OmegaConf.structured(WorkersConfig),
+    )  # the run may have been trained elsewhere
     return to_config(given)
 
 

@@ -5,6 +5,7 @@ import signal
 
 import pytest
 
+import evaluate
 import train
 from agents import collection
 from agents.worker_pools import WorkerLostError
@@ -74,6 +75,15 @@ def test_a_learner_that_dies_goes_on_with_the_batch_that_was_on_its_way(tmp_path
 def test_each_seed_of_a_program_with_workers_is_the_run_that_it_would_be_alone(tmp_path, whole):
     assert run(tmp_path / "program", (*TWO, "n_seeds=2")) == 0, said(tmp_path / "program")
     assert not differences(whole, compared(tmp_path / "program" / "seed0"))
+
+
+def test_a_run_of_a_cluster_is_evaluated_without_one(program, tmp_path, monkeypatch):
+    assert program(train.main, "experiment=smoke", "log.gif=false", "hydra.run.dir=run")[0] == 0
+    config = tmp_path / "run" / ".hydra" / "config.yaml"
+    config.write_text(config.read_text().replace("backend: processes", "backend: ray").replace("count: 0", "count: 3"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    code, output = program(evaluate.main, "run=run", "steps=3", "num_envs=2", "pictures=false")
+    assert code == 0, output
 
 
 class FailingPool:
