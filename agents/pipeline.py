@@ -143,19 +143,23 @@ class MultiStep:
 
     def __init__(self, n_steps: int, gamma: float, n_blocks: int = 1) -> None:
         self.n_steps, self.gamma = n_steps, gamma
-        self.waiting: list[TensorDictBase | None] = [None] * n_blocks
+        self.waiting: TensorDictBase | None = None
+        """Of all blocks, one after the other."""
         self.blocks = [WaitingSteps(self, k) for k in range(n_blocks)]
 
     def __call__(self, transitions: TensorDictBase) -> TensorDictBase:
         """``(num_envs, T) -> (num_envs * T,)``, less than that at the start."""
         if self.n_steps == 1:
             return transitions.reshape(-1)
-        window, waiting = transitions, [steps for steps in self.waiting if steps is not None]
-        if waiting:
-            parts = [torch.cat(waiting), transitions]  # pyright: ignore[reportArgumentType]
-            window = cast(TensorDictBase, torch.cat(parts, dim=1))  # pyright: ignore[reportArgumentType]
-        newest = window[:, max(0, window.shape[1] - self.n_steps + 1) :].clone()
-        self.waiting = list(newest.chunk(len(self.waiting)))
+        if restored := [block.restored for block in self.blocks if block.restored is not None]:
+            self.waiting = cast(TensorDictBase, torch.cat(restored))  # pyright: ignore[reportArgumentType]
+            for block in self.blocks:
+                block.restored = None
+        if self.waiting is None:
+            window = transitions.clone()  # the collector may write into its own
+        else:
+            window = cast(TensorDictBase, torch.cat([self.waiting, transitions], dim=1))  # pyright: ignore[reportArgumentType]
+        self.waiting = window[:, max(0, window.shape[1] - self.n_steps + 1) :]
         length = window.shape[1] - self.n_steps + 1
         if length <= 0:
             return transitions.reshape(-1)[:0]
@@ -183,13 +187,17 @@ class WaitingSteps:
 
     def __init__(self, multi_step: MultiStep, k: int) -> None:
         self.multi_step, self.k = multi_step, k
+        self.restored: TensorDictBase | None = None
+        """From a checkpoint, until they are needed."""
 
     def state_dict(self) -> dict:
         """The steps that wait."""
-        waiting = self.multi_step.waiting[self.k]
+        waiting, others = self.restored, self.multi_step
+        if waiting is None and others.waiting is not None:
+            waiting = others.waiting.chunk(len(others.blocks))[self.k].clone()
         return {"waiting": None} if waiting is None else {"waiting": waiting.to_dict(), "shape": list(waiting.shape)}
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what :meth:`state_dict` returned."""
         waiting = state["waiting"]
-        self.multi_step.waiting[self.k] = None if waiting is None else TensorDict(waiting, state["shape"])
+        self.restored = None if waiting is None else TensorDict(waiting, state["shape"])

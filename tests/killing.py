@@ -68,9 +68,9 @@ def run(folder: Path, arguments: tuple[str, ...] = RUN, **options) -> int:
     return process.exitcode
 
 
-def run_killed_after(folder: Path, seconds: float) -> int:
+def run_killed_after(folder: Path, seconds: float, arguments: tuple[str, ...] = RUN) -> int:
     """Run train.py and kill it ``seconds`` after it began; its exit code."""
-    process = start(folder, RUN)
+    process = start(folder, arguments)
     end = time.monotonic() + seconds
     while process.is_alive() and time.monotonic() < end:
         time.sleep(0.005)

@@ -1,7 +1,8 @@
 """Kills training runs at many instants, lets them go on, and compares them bit for bit with a run that nothing happened to.
 
-``python tests/benchmarks/kill_study.py [--kills 60] [--seed 0]``: half of the kills come at a random time, the others
-inside a write (a checkpoint, replay rows, TensorBoard's file, summary.json, the moving aside of an earlier run).
+``python tests/benchmarks/kill_study.py [--kills 60] [--seed 0] [--workers 0]``: half of the kills come at a random time, the
+others inside a write (a checkpoint, replay rows, TensorBoard's file, summary.json, the moving aside of an earlier run). With
+workers a third of the kills are theirs: the run goes on by itself.
 """
 
 import argparse
@@ -17,10 +18,10 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the programs are run as files
 
 from conf.versions import git_hash
-from tests.killing import STAGES, differences, result, run, run_killed_after
+from tests.killing import RUN, STAGES, differences, result, run, run_killed_after
 
 
-def study(kills: int, seed: int, work: Path) -> tuple[Counter, Counter, list[str]]:
+def study(kills: int, seed: int, work: Path, workers: int = 0) -> tuple[Counter, Counter, list[str]]:
     """Kill until ``kills`` processes have died.
 
     Returns:
@@ -28,32 +29,46 @@ def study(kills: int, seed: int, work: Path) -> tuple[Counter, Counter, list[str
     """
     draw, died, runs, wrong = random.Random(seed), Counter(), Counter(), []
     start = time.monotonic()
-    code = run(work / "whole")
+    arguments = (*RUN, f"workers.count={workers}")
+    code = run(work / "whole", arguments)
     length = time.monotonic() - start
     if code:
         raise RuntimeError(Path(f"{work / 'whole'}.log").read_text())
-    whole = result(work / "whole")
+    whole = compared(work / "whole")
     while sum(died.values()) < kills:
         folder, code, times = work / f"run_{sum(runs.values())}", -1, 0
         while code:  # killed again and again, until it ends
+            lost = 0
             if draw.random() < 0.2:
-                code, instant = run(folder), "none"
+                code, instant = run(folder, arguments), "none"
+            elif workers and draw.random() < 1 / 3:
+                code, instant = run(folder, arguments, stage="in a worker", count=draw.randint(1, 32)), "in a worker"
+                lost = "was lost" in Path(f"{folder}.log").read_text()
+                Path(f"{folder}.log").unlink()
             elif draw.random() < 0.5:
-                code, instant = run_killed_after(folder, draw.uniform(0.05, length)), "random time"
+                code, instant = run_killed_after(folder, draw.uniform(0.05, length), arguments), "random time"
             else:
                 instant = draw.choice(STAGES)
                 once = instant in ("in summary", "in set-aside", "in clearing")  # comes once, if at all
-                code = run(folder, stage=instant, count=1 if once else draw.choice((1, 1, 2, 3, 5, 8, 13)))
+                code = run(folder, arguments, stage=instant, count=1 if once else draw.choice((1, 1, 2, 3, 5, 8, 13)))
             if code > 0:
                 raise RuntimeError(Path(f"{folder}.log").read_text())
-            times += code < 0
-            died[instant] += code < 0
+            times += (code < 0) + lost
+            died[instant] += (code < 0) + lost
         runs[times] += 1
-        found = differences(whole, result(folder))
+        found = differences(whole, compared(folder))
         wrong += [f"{folder.name}: {name}" for name in found]
         print(f"{folder.name}: {times} kills, {len(found)} differences", file=sys.stderr, flush=True)
         shutil.rmtree(folder)
     return +died, runs, wrong
+
+
+def compared(folder: Path) -> dict:
+    """A run's result without the number of workers that it lost."""
+    found = result(folder)
+    found["summary"].pop("workers_lost", None)
+    found["checkpoint"]["parts"]["env"].pop("lost", None)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,10 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=60, help="processes to kill")
     parser.add_argument("--seed", type=int, default=0, help="of the instants")
+    parser.add_argument("--workers", type=int, default=0, help="processes that collect")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as work:
-        died, runs, wrong = study(options.kills, options.seed, Path(work))
-    print(f"### Kill study, seed {options.seed}, commit {git_hash()[:12]}\n")
+        died, runs, wrong = study(options.kills, options.seed, Path(work), options.workers)
+    print(f"### Kill study, seed {options.seed}, {options.workers} workers, commit {git_hash()[:12]}\n")
     print("| killed | processes |\n| :-- | --: |")
     print("\n".join(f"| {instant} | {count} |" for instant, count in sorted(died.items())))
     print(f"\n{sum(died.values())} kills in {sum(runs.values())} runs (kills per run: ", end="")
