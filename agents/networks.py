@@ -266,7 +266,8 @@ class ExplorationNoise(TensorDictModuleBase):
     def set_extra_state(self, state: dict) -> None:
         """Restore what :meth:`get_extra_state` returned."""
         self.generator.set_state(state["generator"].cpu())
-        self.frames, self.process = state["frames"], state["process"]
+        self.frames, process = state["frames"], state["process"]
+        self.process = None if process is None else process.to(self.generator.device)
 
 
 class NoiseOfSeeds(TensorDictModuleBase):

@@ -152,7 +152,7 @@ class MultiStep:
         if self.n_steps == 1:
             return transitions.reshape(-1)
         if restored := [block.restored for block in self.blocks if block.restored is not None]:
-            self.waiting = cast(TensorDictBase, torch.cat(restored))  # pyright: ignore[reportArgumentType]
+            self.waiting = cast(TensorDictBase, torch.cat(restored)).to(transitions.device)  # pyright: ignore[reportArgumentType]
             for block in self.blocks:
                 block.restored = None
         if self.waiting is None:

@@ -36,6 +36,7 @@ UNNAMED = {
     "hydra",
     "experiment",
     "method",
+    *("workers.backend", "workers.ray_address", "workers.gpus"),
 }
 UNNAMED_EVALUATION = UNNAMED | {"controller", "folder", "steps", "num_envs", "pictures", "restart"}
 SHOWN = 3  # names per problem in an error: messages have at most 8 lines
@@ -161,7 +162,7 @@ def _names_world(override: str) -> bool:
 
 
 def _named(overrides: list[str], unnamed: set[str]) -> list[str]:
-    return sorted(entry for entry in overrides if re.split(r"[.=@]", entry)[0] not in unnamed)
+    return sorted(entry for entry in overrides if not {re.split(r"[.=@]", entry)[0], entry.split("=")[0]} & unnamed)
 
 
 def _flat(content: Any, prefix: str) -> dict[str, float]:

@@ -126,6 +126,11 @@ class TrainingRun:
             raise CheckpointError(
                 f"seed {self.seed}: its checkpoint of {latest} frames is gone. Start the program again."
             )
+        if self.recorder.frames > self.config.collector.total_frames:
+            raise CheckpointError(
+                f"resume={self.config.resume}: its checkpoint is at {self.recorder.frames} frames, beyond "
+                f"collector.total_frames={self.config.collector.total_frames}: ask for more, or take an older one."
+            )
         self.learns_from += 0 if kept_rows else self.recorder.frames
         log, settings = self.config.log, self.settings | {"seed": self.seed}
         self.board = Board(self.folder, self.recorder.frames, settings, figures=log.figures, gif=log.gif)

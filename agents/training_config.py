@@ -61,13 +61,13 @@ class WorkersConfig:
     ray_address: str | None = None
     """Of a running Ray cluster, auto or <host>:<port>; null = start one on this machine."""
     gpus: float = 0.0
-    """ray: share of a GPU for each worker, 0..8; 0 = the workers compute on CPUs."""
+    """ray: share of a GPU for each worker, 0..1; 0 = the workers compute on CPUs."""
 
     def __post_init__(self) -> None:
         """Check every field."""
         check_range("workers.count", self.count, 0, 1000)
         check_choice("workers.backend", self.backend, ("processes", "ray"))
-        check_range("workers.gpus", self.gpus, 0, 8)
+        check_range("workers.gpus", self.gpus, 0, 1)
         if self.backend == "ray" and importlib.util.find_spec("ray") is None:
             raise ValueError(
                 "workers.backend=ray needs the package ray, which is not installed: pip install -c constraints-extras.txt -e "

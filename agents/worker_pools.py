@@ -1,15 +1,18 @@
 """Where workers (:mod:`agents.workers`) run: processes of this machine, or actors of a Ray cluster."""
 
+import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol
 
+from agents.ray_cluster import reach_ray
 from agents.workers import WorkerTask, WorldsCollector
 
 
@@ -54,6 +57,7 @@ class ProcessPool:
         self.context = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:
             self.context.set_forkserver_preload([__name__])
+            _start_server()
         self._executors: dict[int, ProcessPoolExecutor] = {}
         self._pending: dict[int, Future] = {}
 
@@ -84,14 +88,29 @@ class ProcessPool:
             executor.shutdown(cancel_futures=True)
 
 
+# What is sent to a whole process group is the learner's business: Ctrl-C, a batch system's end and its warning before it.
+GROUP_SIGNALS = {getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGUSR2") if hasattr(signal, name)}
+
+
+def _start_server() -> None:
+    """Start the server that workers are forked from, with these signals blocked, as they are in its children then."""
+    from multiprocessing import forkserver
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, GROUP_SIGNALS)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 _worker: dict[str, Any] = {}  # of a worker's process
 
 
 def _serve(task: WorkerTask, states: bytes | None) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the learner ends its workers
+    for number in GROUP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_learner, daemon=True).start()
-    _worker.update(task=task, states=states)
+    _worker["collector"] = WorldsCollector(lambda: task, states=states)
 
 
 def _end_with_learner() -> None:
@@ -102,9 +121,26 @@ def _end_with_learner() -> None:
 
 
 def _collect(weights: bytes) -> bytes:
-    if "collector" not in _worker:  # here and not in _serve, whose errors reach the learner without their message
-        _worker["collector"] = WorldsCollector(lambda: _worker["task"], states=_worker["states"])
-    return _worker["collector"].collect(weights)
+    try:
+        return _worker["collector"].collect(weights)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # it would break the pipe, and look like a dead worker
+            raise RuntimeError(f"in a worker: {type(error).__name__}: {error}") from None
+        raise
+
+
+@contextlib.contextmanager
+def kept_handlers() -> Iterator[None]:
+    """Context that ends with the signal handlers it began with: Ray's own ends a program without a checkpoint."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 class RayPool:
@@ -118,13 +154,21 @@ class RayPool:
 
     def __init__(self, tasks: Sequence[WorkerTask], address: str | None, gpus: float) -> None:
         import ray  # pyright: ignore[reportMissingImports]
+
+        if ray.is_initialized():
+            raise OSError(
+                "workers.backend=ray in a program that Ray runs already, which keeps the cores (hydra/launcher=ray_local?): take "
+                "workers.backend=processes, or another launcher."
+            )
+        if address is not None:
+            reach_ray(address, "workers.ray_address")
         from torchrl.collectors.distributed import RayCollector
 
         self.tasks, self.ray = tasks, ray
         self.resources = {"num_cpus": max(1, tasks[0].threads), "num_gpus": gpus}
         init = {"address": address or "local", "log_to_driver": False, "logging_level": "error"}
         own_cluster = {"num_cpus": len(tasks) * self.resources["num_cpus"], "include_dashboard": False}
-        with warnings.catch_warnings():  # that it is given no policy: each worker makes its own
+        with warnings.catch_warnings(), kept_handlers():  # that it is given no policy: each worker makes its own
             warnings.simplefilter("ignore", UserWarning)
             self.collector = RayCollector(
                 *([], None),  # no workers yet
@@ -139,13 +183,15 @@ class RayPool:
 
     def _check_resources(self, address: str | None) -> None:
         there = self.ray.cluster_resources()
+        if address is not None:  # others may be at work there
+            there = self.ray.available_resources()
         for ray_name, name in (("CPU", "num_cpus"), ("GPU", "num_gpus")):
             needed, offered = len(self.tasks) * self.resources[name], there.get(ray_name, 0)
             if needed > offered:
                 self.close()
                 raise OSError(
                     f"workers.count={len(self.tasks)} need {needed:g} {ray_name}s, and the Ray cluster "
-                    f"{address or 'of this machine'} has {offered:g}: take fewer workers, threads or workers.gpus, or add nodes."
+                    f"{address or 'of this machine'} has {offered:g} free: fewer workers, threads or workers.gpus, or more nodes."
                 )
 
     def start(self, k: int, states: bytes | None) -> None:

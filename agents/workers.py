@@ -57,7 +57,8 @@ class WorkerTask:
 
 
 class WorldsCollector(Collector):
-    """TorchRL's collector in a worker.
+    """TorchRL's collector in a worker, built at the first batch: an error then reaches the learner as what it is, while Ray takes
+    one of a constructor for a dead worker.
 
     Args:
         task: a function that returns the :class:`WorkerTask` (TorchRL's collectors are given functions that make things).
@@ -65,9 +66,12 @@ class WorldsCollector(Collector):
         options: TorchRL's, most of them those of its :class:`torchrl.collectors.distributed.RayCollector`.
     """
 
-    def __init__(self, task: Any, *, states: bytes | None, **options: Any) -> None:
+    def __init__(self, task: Callable[[], WorkerTask], *, states: bytes | None, **options: Any) -> None:
+        self.closed, self.total_frames = True, 0  # what TorchRL and Ray ask of an unfinished one
         options.pop("policy_factory", None)
-        task = task()
+        self._unbuilt = (task(), states, options)
+
+    def _build(self, task: WorkerTask, states: bytes | None, options: dict[str, Any]) -> None:
         use_threads(task.threads, deterministic=task.deterministic)
         n_blocks, device = len(task.env_seeds), torch.device(task.device)
         worlds = SurveillanceEnv(
@@ -96,6 +100,9 @@ class WorldsCollector(Collector):
         Returns:
             Pickled batch (batch size and :func:`flat`) and list of each block's state after it, "worlds" and "noise".
         """
+        if self._unbuilt is not None:
+            self._build(*self._unbuilt)
+            self._unbuilt = None
         own = loads(weights)
         for name, value in self.actor_weights.items():
             value.copy_(torch.stack([part[name] for part in own]).view_as(value))

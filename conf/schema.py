@@ -10,10 +10,11 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import make_controller
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
+from agents.ray_cluster import reach_ray
 from agents.training_config import Config, WorkersConfig
 from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig
-from conf.launching import reach_ray, register_resolvers
+from conf.launching import register_resolvers
 from conf.manual import check_names, groups, manual
 from conf.naming import GROUPS, config_hash, evaluation_folder, hashed_config, program_name
 from conf.report_schema import ReportConfig

@@ -19,6 +19,7 @@ from omegaconf import OmegaConf
 import evaluate
 import report
 import train
+from agents import ray_cluster
 from agents.interruption import STOP_FILE, InterruptedRunError, StopSignals
 from conf import launching
 from conf.job_log import FailedRunError
@@ -297,7 +298,7 @@ def test_a_ray_cluster_that_does_not_answer_is_named(monkeypatch, tmp_path):
         with pytest.raises(launching.SweepError, match=f"the Ray cluster at {address} does not answer"):
             launching.check_launcher("ray_local", settings(address))
         taken.listen()  # somebody does, who is no Ray
-        monkeypatch.setattr(launching, "REACH_SECONDS", 0.1)
+        monkeypatch.setattr(ray_cluster, "REACH_SECONDS", 0.1)
         waits = tmp_path / "waits"
         waits.write_text("#!/bin/sh\nexec sleep 20\n")
         waits.chmod(0o755)

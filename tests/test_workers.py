@@ -1,14 +1,23 @@
 """Workers: what they collect, and that neither a dead worker nor a dead learner changes it."""
 
+import dataclasses
 import importlib.util
+import multiprocessing
+import os
 import signal
 
 import pytest
+import torch
 
 import evaluate
 import train
 from agents import collection
-from agents.worker_pools import WorkerLostError
+from agents.collection import worker_task
+from agents.networks import make_actor
+from agents.training_config import Config
+from agents.worker_pools import ProcessPool, WorkerLostError
+from agents.workers import dumps, loads, weights_of
+from envs import SurveillanceEnv
 from tests.killing import RUN, differences, result, run
 
 pytestmark = pytest.mark.xdist_group("workers")  # its fixtures are made once, not by every worker
@@ -86,6 +95,30 @@ def test_a_run_of_a_cluster_is_evaluated_without_one(program, tmp_path, monkeypa
     assert code == 0, output
 
 
+def test_a_worker_heeds_no_signal_of_the_group_and_tells_its_own_errors():
+    config = Config()
+    config.collector.num_envs = config.workers.count = 1
+    good = worker_task(config, [0], 0, torch.device("cpu"))
+    actor = make_actor(SurveillanceEnv(config.env).n_observation, config.env, config.agent)
+    weights = dumps([weights_of(actor)])
+    pool = ProcessPool([good, dataclasses.replace(good, device="nowhere")])
+    try:
+        for k in range(2):
+            pool.start(k, None)
+            pool.request(k, weights)
+        (_, batch), _ = loads(pool.answer(0))
+        assert batch["agents", "action"].shape == (1, 1, 3, 2)
+        for child in multiprocessing.active_children():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2):
+                os.kill(child.pid, number)
+        pool.request(0, weights)
+        assert pool.answer(0)
+        with pytest.raises(RuntimeError, match="nowhere"):
+            pool.answer(1)
+    finally:
+        pool.close()
+
+
 class FailingPool:
     """Workers that die whatever one asks of them."""
 
@@ -145,6 +178,8 @@ def test_workers_of_a_ray_cluster(tmp_path, whole):
     pytest.importorskip("ray", reason="needs the extra ray")
     folder, arguments = tmp_path / "run", (*TWO, "workers.backend=ray")
     assert run(folder, arguments, stage="in training", count=5) == -signal.SIGKILL, said(folder)
+    assert run(folder, arguments, stage="in training", count=4, by=signal.SIGTERM) == 143, said(folder)
+    assert "stopped by SIGTERM" in said(folder)
     assert run(folder, arguments, stage="in a Ray worker", count=3) == 0, said(folder)
     assert "started anew, it collects its last batch again." in said(folder)
     assert result(folder)["summary"]["workers_lost"] == 1
