@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents import checkpoint
+from agents import checkpoint, worker_pools
 from agents.recorder import TrainingRecorder
 
 RUN = (
@@ -85,6 +85,8 @@ def _train(
 ) -> None:
     import train
 
+    # a test that started workers in pytest's own process has started this one's server too, with these blocked
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, worker_pools.GROUP_SIGNALS)
     torch.set_num_threads(1)
     with Path(f"{folder}.log").open("a") as log:
         os.dup2(log.fileno(), 1)
