@@ -20,7 +20,7 @@ from agents.collection import make_collection, seeds_of_streams
 from agents.interruption import StopSignals
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import ExplorationNoise, make_policies
+from agents.networks import make_policies, noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds
 from agents.run import (
@@ -82,7 +82,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     learners, learner = make_learners(eval_env.n_observation, world, config.agent, safety, device, seeds=seeds)
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
     (_, safety_filter), explore_policy = policies
-    noises = [module for module in explore_policy.modules() if isinstance(module, ExplorationNoise)]  # one per seed
+    noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
     adversary = config.adversary_reward()

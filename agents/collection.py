@@ -181,14 +181,12 @@ class WorkerCollection:
             pool.close()
 
     def _states(self, k: int) -> bytes | None:
-        if self.blocks[0].states is None:
-            return None
-        return dumps([block.states[k] for block in self.blocks if block.states is not None])
+        states = [block.states[k] for block in self.blocks if block.states]
+        return dumps(states) if states else None
 
     def _request(self, pool: Pool) -> None:
         for block, learner in zip(self.blocks, self.learners, strict=True):
-            block.acting = block.resumed or copied(weights_of(learner.actor))
-            block.resumed = None
+            block.acting = block.acting or copied(weights_of(learner.actor))  # a checkpoint's batch is asked for again
         self._weights = dumps([block.acting for block in self.blocks])
         for k in range(self.count):
             pool.request(k, self._weights)
@@ -222,9 +220,8 @@ class WorkerBlock:
     """A seed's worlds in all workers: their states after the last batch, and the policy of a batch on its way."""
 
     def __init__(self) -> None:
-        self.states: list[dict[str, Any]] | None = None
+        self.states: list[dict[str, Any]] = []
         self.acting: Weights | None = None
-        self.resumed: Weights | None = None
         self.lost = 0
         """Workers that died."""
 
@@ -237,4 +234,4 @@ class WorkerBlock:
         """Go on from what :meth:`state_dict` returned."""
         acting = state_dict["acting"]
         self.states, self.lost = state_dict["states"], state_dict["lost"]
-        self.resumed = None if acting is None else {tuple(name.split(".")): value for name, value in acting.items()}
+        self.acting = None if acting is None else {tuple(name.split(".")): value for name, value in acting.items()}

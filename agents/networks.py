@@ -270,6 +270,11 @@ class ExplorationNoise(TensorDictModuleBase):
         self.process = None if process is None else process.to(self.generator.device)
 
 
+def noises_of(policy: nn.Module) -> list[ExplorationNoise]:
+    """The exploration noise in a policy, one per learner."""
+    return [module for module in policy.modules() if isinstance(module, ExplorationNoise)]
+
+
 class NoiseOfSeeds(TensorDictModuleBase):
     """Exploration noise of several learners, each on its block of the worlds.
 

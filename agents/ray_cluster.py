@@ -31,9 +31,8 @@ def reach_ray(address: str, option: str) -> None:
         else:
             host, port = found.group(2).strip("[]"), int(found.group(3))
             socket.create_connection((host, port), timeout=REACH_SECONDS).close()
-            if not found.group(
-                1
-            ):  # somebody answers: is it Ray? What the check finds, it finds at once: others keep it waiting
+            # Somebody answers: is it Ray? Whatever the check finds, it finds at once; what is no Ray keeps it waiting.
+            if not found.group(1):
                 check += ["--address", f"{host}:{port}"]
                 subprocess.run(check, timeout=4 * REACH_SECONDS, capture_output=True, check=False)
     except (OSError, OverflowError) as error:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.collectors import Collector
 
 from agents.config import AgentConfig
-from agents.networks import ExplorationNoise, make_actor, make_policies
+from agents.networks import make_actor, make_policies, noises_of
 from agents.pipeline import COLLECTOR_OPTIONS, use_threads
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig
@@ -82,7 +82,7 @@ class WorldsCollector(Collector):
             *(actor, task.world, task.safety, task.agent, task.noise_seeds, device), compile=task.compile
         )
         self.actor_weights = weights_of(actor)
-        self.noises = [module for module in policy.modules() if isinstance(module, ExplorationNoise)]
+        self.noises = noises_of(policy)
         going_on: list[dict] = [] if states is None else loads(states)
         for block, state in zip(worlds.blocks, going_on, strict=bool(going_on)):
             block.continue_from(state["worlds"])

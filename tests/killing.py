@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -106,11 +107,11 @@ def _arm(stage: str, count: int, by: int) -> None:
     """Make the process send itself a signal when it gets to ``stage`` for the ``count``-th time."""
     left = count
 
-    def die(condition: bool = True) -> None:
+    def die(condition: bool = True, victim: Callable[[], int] = os.getpid) -> None:
         nonlocal left
         left -= condition
         if condition and not left:
-            os.kill(os.getpid(), by)
+            os.kill(victim(), by)
 
     save, replace = torch.save, Path.replace
 
@@ -145,11 +146,8 @@ def _arm(stage: str, count: int, by: int) -> None:
 
     def patched_update(self, batch, update=TrainingRecorder.update):
         die(stage == "in training")
-        if stage in ("in a worker", "in a Ray worker"):
-            nonlocal left
-            left -= 1
-            if not left:
-                os.kill(_worker_of_ray() if "Ray" in stage else multiprocessing.active_children()[0].pid, by)
+        die(stage == "in a worker", _worker)
+        die(stage == "in a Ray worker", _worker_of_ray)
         update(self, batch)
 
     TrainingRecorder.update = patched_update
@@ -169,6 +167,12 @@ def _arm(stage: str, count: int, by: int) -> None:
         RecordWriter.write = patched_write
 
 
+def _worker() -> int:
+    pid = multiprocessing.active_children()[0].pid
+    assert pid is not None
+    return pid
+
+
 def _worker_of_ray() -> int:
     titles = {int(path.parent.name): path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline")}
     return max(pid for pid, title in titles.items() if title.startswith(b"ray::WorldsCollector"))
@@ -181,6 +185,8 @@ def result(folder: Path) -> dict:
         summary.pop(name)
     content = checkpoint.load_checkpoint(checkpoint.latest_checkpoint(folder))
     content["parts"].pop("seconds")
+    summary.pop("workers_lost", None)  # they change nothing, it is promised
+    content["parts"]["env"].pop("lost", None)
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "histograms": 0, "images": 0}).Reload()
     tags = [tag for tag in sorted(events.Tags()["scalars"]) if not tag.startswith("time/")]
     curves: dict[str, list] = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags}

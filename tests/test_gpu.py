@@ -15,7 +15,7 @@ from agents.collection import make_collection
 from agents.config import AgentConfig
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import ExplorationNoise, make_policies
+from agents.networks import make_policies, noises_of
 from agents.pipeline import to_transitions
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, keys
@@ -33,7 +33,7 @@ def collected(device: str, num_envs: int = 64, steps: int = 20, **settings) -> t
     place, n_observation = torch.device(device), SurveillanceEnv(config.env).n_observation
     learners, learner = make_learners(n_observation, config.env, config.agent, config.safety, place, seeds=[0])
     _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, [0], place)
-    noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
+    noises = noises_of(explore)
     collection = make_collection(config, [0], learners, explore, noises, place, print)
     return next(collection.batches(num_envs * steps, resumed=False)), config
 

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from agents.collection import make_collection
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import ExplorationNoise, make_policies
+from agents.networks import make_policies, noises_of
 from agents.pipeline import MultiStep, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config
@@ -67,7 +67,7 @@ def waits(world: SurveillanceConfig, num_envs: int) -> dict[str, float]:
         SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=[0]
     )
     _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU)
-    noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
+    noises = noises_of(explore)
     collection = make_collection(config, [0], learners, explore, noises, CPU, print)
     batches = collection.batches(100 * num_envs, resumed=False)
     multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, CPU, 0)

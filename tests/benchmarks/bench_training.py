@@ -53,7 +53,7 @@ from agents.divergence import check_batch
 from agents.incident import check_violations
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import ExplorationNoise, make_policies
+from agents.networks import make_policies, noises_of
 from agents.pipeline import MultiStep, make_buffer, to_transitions, use_threads
 from agents.recorder import Seconds, TrainingRecorder
 from agents.training_config import Config
@@ -218,7 +218,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     n_observation = SurveillanceEnv(config.env).n_observation
     learners, learner = make_learners(n_observation, config.env, config.agent, config.safety, device, seeds=seeds)
     _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, seeds, device)
-    noises = [module for module in explore.modules() if isinstance(module, ExplorationNoise)]
+    noises = noises_of(explore)
     collection = make_collection(config, seeds, learners, explore, noises, device, print)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
     minibatch = config.buffer.batch_size

@@ -34,7 +34,7 @@ def study(kills: int, seed: int, work: Path, workers: int = 0) -> tuple[Counter,
     length = time.monotonic() - start
     if code:
         raise RuntimeError(Path(f"{work / 'whole'}.log").read_text())
-    whole = compared(work / "whole")
+    whole = result(work / "whole")
     while sum(died.values()) < kills:
         folder, code, times = work / f"run_{sum(runs.values())}", -1, 0
         while code:  # killed again and again, until it ends
@@ -56,19 +56,11 @@ def study(kills: int, seed: int, work: Path, workers: int = 0) -> tuple[Counter,
             times += (code < 0) + lost
             died[instant] += (code < 0) + lost
         runs[times] += 1
-        found = differences(whole, compared(folder))
+        found = differences(whole, result(folder))
         wrong += [f"{folder.name}: {name}" for name in found]
         print(f"{folder.name}: {times} kills, {len(found)} differences", file=sys.stderr, flush=True)
         shutil.rmtree(folder)
     return +died, runs, wrong
-
-
-def compared(folder: Path) -> dict:
-    """A run's result without the number of workers that it lost."""
-    found = result(folder)
-    found["summary"].pop("workers_lost", None)
-    found["checkpoint"]["parts"]["env"].pop("lost", None)
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
