@@ -54,7 +54,9 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, compile_functions=config.compile)
+    safety.check_sizes(fixed_sizes=config.fixed_sizes)
+    computing = {"compile_functions": config.compile, "fixed_sizes": config.fixed_sizes}
+    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, **computing)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)
@@ -63,7 +65,8 @@ def main(cfg: DictConfig) -> None:
     else:
         name = config.controller or ""
         nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
-    policy = TensorDictSequential(nominal, SafetyFilter(safety, world, compile=config.compile))
+    safety_filter = SafetyFilter(safety, world, compile=config.compile, fixed_sizes=config.fixed_sizes)
+    policy = TensorDictSequential(nominal, safety_filter)
     steps = config.steps or rollout_steps(world.horizon)
     asked = {
         "steps": steps,

@@ -78,9 +78,9 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     use_threads(config.threads, deterministic=config.deterministic)
     world, safety, seeds = config.env, config.safety, list(folders)
     noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
-    eval_env = SurveillanceEnv(world, config.eval.num_envs, device, compile_functions=config.compile)
+    eval_env = SurveillanceEnv(world, config.eval.num_envs, device, **config.computing)
     learners, learner = make_learners(eval_env.n_observation, world, config.agent, safety, device, seeds=seeds)
-    policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, compile=config.compile)
+    policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, **config.computing)
     (_, safety_filter), explore_policy = policies
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)

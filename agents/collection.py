@@ -100,7 +100,7 @@ def worker_task(config: Config, seeds: Sequence[int], k: int, device: torch.devi
         steps=config.collector.steps_per_batch,
         device="cuda" if workers.gpus or (device.type == "cuda" and workers.backend == "processes") else "cpu",
         threads=config.threads,
-        compile=config.compile,
+        computing=config.computing,
         deterministic=config.deterministic,
     )
 
@@ -120,7 +120,7 @@ class LocalCollection:
     ) -> None:
         n_worlds = len(seeds) * config.collector.num_envs
         env_seeds = [seeds_of_streams(seed)[0] for seed in seeds]
-        self.env = SurveillanceEnv(config.env, n_worlds, device, seed=env_seeds, compile_functions=config.compile)
+        self.env = SurveillanceEnv(config.env, n_worlds, device, seed=env_seeds, **config.computing)
         self.blocks = self.env.blocks
         self.policy = explore_policy
         self.frames_per_batch = config.collector.frames_per_batch * len(seeds)

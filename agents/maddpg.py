@@ -130,6 +130,27 @@ class MADDPGLoss(DDPGLoss):
         return critic.values(observation, own, others, layers).squeeze(-1)
 
 
+class LayersUpdate(SoftUpdate):
+    """``SoftUpdate`` on the networks' layers: on TensorDicts it takes five times as long.
+
+    Args:
+        loss: the losses.
+        tau: share of the networks that the targets take over.
+    """
+
+    def __init__(self, loss: MADDPGLoss, *, tau: float) -> None:
+        super().__init__(loss, tau=tau)
+        self.layers = loss.layers
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move all targets by one step."""
+        for name in ("actor", "value"):
+            for target, source in zip(self.layers[f"target_{name}"], self.layers[name], strict=True):
+                for mine, theirs in zip(target, source, strict=True):
+                    mine.lerp_(theirs, 1 - self.eps)
+
+
 def check_loss(agent: AgentConfig, safety: SafetyConfig) -> None:
     """Raise a ``ValueError`` if the loss cannot be what both ask for."""
     if agent.correction_penalty and not safety.in_loss:
@@ -165,7 +186,7 @@ def make_loss(
     policy = TensorDictSequential(actor, SafetyFilter(safety, world) if filtered else unfiltered)
     nominal = agent.critic_action != "executed" and not filtered
     loss = MADDPGLoss(policy, critic, agent, world.max_speed, nominal=nominal, filtered=filtered)
-    return loss, SoftUpdate(loss, tau=agent.tau)
+    return loss, LayersUpdate(loss, tau=agent.tau)
 
 
 def make_optimizers(loss: MADDPGLoss, agent: AgentConfig) -> dict[str, torch.optim.Optimizer]:

@@ -9,7 +9,7 @@ from torchrl.modules import MultiAgentMLP
 from agents.config import AgentConfig
 from agents.foresight import Foresight
 from envs import SurveillanceConfig, keys
-from envs.dynamics import other_indices
+from envs.dynamics import other_indices, take
 from safety import SafetyConfig, SafetyFilter
 
 JOINT_ACTION = ("agents", "joint_action")
@@ -198,7 +198,7 @@ def joint_action(own: Tensor, others: Tensor, *, centralized: bool) -> Tensor:
     """
     if not centralized:
         return own
-    rest = others[..., other_indices(own.shape[-2], own.device), :]
+    rest = take(others, other_indices(own.shape[-2], own.device), -2)
     return torch.cat([own.unsqueeze(-2), rest], dim=-2).flatten(-2)
 
 
@@ -325,7 +325,8 @@ def make_policies(
     seed: int | list[int],
     device: torch.device,
     *,
-    compile: bool = False,
+    compile_functions: bool = False,
+    fixed_sizes: bool = False,
 ) -> tuple[TensorDictSequential, TensorDictSequential]:
     """Deployment policy ``actor -> filter`` and exploration policy ``actor -> noise -> filter``.
 
@@ -336,12 +337,13 @@ def make_policies(
         agent: the noise.
         seed: seed of the noise; a list: one per learner, each with its block of the worlds.
         device: of the noise's generator.
-        compile: the filter's pure functions, see :class:`safety.SafetyFilter`.
+        compile_functions: the filter's ``compile``, see :class:`safety.SafetyFilter`.
+        fixed_sizes: the filter's.
 
     Returns:
         ``(policy, explore_policy)``; both execute filtered actions only.
     """
-    safety_filter = SafetyFilter(safety, world, compile=compile)
+    safety_filter = SafetyFilter(safety, world, compile=compile_functions, fixed_sizes=fixed_sizes)
     if isinstance(seed, list):
         noise = NoiseOfSeeds([ExplorationNoise(agent, world, own, device) for own in seed])
     else:

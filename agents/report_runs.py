@@ -31,6 +31,7 @@ UNNAMED = {
     "resume",
     "debug",
     "compile",
+    "fixed_sizes",
     "checkpoint",
     "eval",
     "hydra",

@@ -205,12 +205,17 @@ class Config:
     resume: str = "auto"
     """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
     the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
-    of that run's folder; only collector.total_frames, train, eval and compile may differ from its settings."""
+    of that run's folder; only collector.total_frames, train, eval, compile and
+    fixed_sizes may differ from its settings."""
     deterministic: bool = False
     """Refuse operations of PyTorch that may differ between runs of the same seed (CUDA has some; slower there)."""
     compile: bool = False
-    """Run the pure tensor functions of step and shield through torch.compile (a minute at the start); same results to
-    rounding. Where there is no C++ compiler: a warning, and as false."""
+    """Run pure tensor functions of step and shield through torch.compile (a minute at the start), with fixed_sizes the whole
+    filter; same results to rounding. Where there is no C++ compiler: a warning, and as false."""
+    fixed_sizes: bool = False
+    """Compute step and filter for all robots instead of those that need it, so that no size depends on the data: the host of
+    a GPU then does not wait within a step. Slower on a CPU. Where no closed form solves a program the robot holds, and where
+    the shield would act all robots of that world drive home."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
@@ -239,6 +244,7 @@ class Config:
                 "worker steps as many worlds as the others."
             )
         self.safety.gains(self.env)
+        self.safety.check_sizes(fixed_sizes=self.fixed_sizes)
         check_loss(self.agent, self.safety)
         steps = self.collector.total_frames // self.collector.num_envs
         if steps < self.agent.n_steps:
@@ -248,6 +254,11 @@ class Config:
                 f"{steps} steps of every world."
             )
         self.adversary_reward()
+
+    @property
+    def computing(self) -> dict[str, bool]:
+        """How worlds and filter compute: arguments of :class:`envs.SurveillanceEnv` and ``make_policies``."""
+        return {"compile_functions": self.compile, "fixed_sizes": self.fixed_sizes}
 
     @property
     def all_seeds(self) -> list[int]:

@@ -6,7 +6,7 @@ dead worker anew just where it was.
 
 import pickle
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -39,7 +39,7 @@ class WorkerTask:
         steps: vector steps of a batch.
         device: where it computes.
         threads: CPU threads.
-        compile: run pure tensor functions through torch.compile.
+        computing: how worlds and filter compute (:attr:`agents.training_config.Config.computing`).
         deterministic: refuse operations that may differ between runs.
     """
 
@@ -52,7 +52,7 @@ class WorkerTask:
     steps: int
     device: str = "cpu"
     threads: int = 1
-    compile: bool = False
+    computing: dict[str, bool] = field(default_factory=dict)
     deterministic: bool = False
 
 
@@ -74,12 +74,10 @@ class WorldsCollector(Collector):
     def _build(self, task: WorkerTask, states: bytes | None, options: dict[str, Any]) -> None:
         use_threads(task.threads, deterministic=task.deterministic)
         n_blocks, device = len(task.env_seeds), torch.device(task.device)
-        worlds = SurveillanceEnv(
-            *(task.world, n_blocks * task.num_envs, device, task.env_seeds), compile_functions=task.compile
-        )
+        worlds = SurveillanceEnv(*(task.world, n_blocks * task.num_envs, device, task.env_seeds), **task.computing)
         actor = make_actor(worlds.n_observation, task.world, task.agent, n_blocks).to(device)
         _, policy = make_policies(
-            *(actor, task.world, task.safety, task.agent, task.noise_seeds, device), compile=task.compile
+            *(actor, task.world, task.safety, task.agent, task.noise_seeds, device), **task.computing
         )
         self.actor_weights = weights_of(actor)
         self.noises = noises_of(policy)

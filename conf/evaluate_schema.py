@@ -48,7 +48,9 @@ class EvaluateConfig:
     restart: bool = False
     """Draw a world anew after a violation and go on counting in it; otherwise it counts until its first one."""
     compile: bool = False
-    """As train.py's: run the pure tensor functions of step and shield through torch.compile."""
+    """As train.py's: run pure tensor functions of step and shield through torch.compile."""
+    fixed_sizes: bool = False
+    """As train.py's: let no size of a step depend on the data, for a GPU."""
     resume: str = "never"
     """auto: an evaluation that has its eval.json is left alone, so that a killed sweep goes on. never: evaluate anew."""
     debug: bool = False

@@ -36,11 +36,12 @@ def config_hash(cfg: DictConfig) -> str:
 
 
 def hashed_config(cfg: DictConfig) -> dict:
-    """The resolved configuration without :data:`NOT_HASHED`, nested; workers only where there are some."""
+    """The resolved configuration without :data:`NOT_HASHED`, nested; workers and fixed sizes only where there are some."""
     found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
     workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
     kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
-    return found | kept
+    fixed = {"fixed_sizes": True} if found.pop("fixed_sizes", False) else {}
+    return found | kept | fixed
 
 
 def run_name(cfg: DictConfig, seed: int) -> str:

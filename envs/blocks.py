@@ -55,6 +55,7 @@ class WorldBlock:
             value = self.env.state[name].clone()
             value[self.worlds] = given[name].to(value)
             self.env.state[name] = value
+        self.env.sure_steps = 0.0
         self.generator.set_state(state_dict["generator"].cpu())
 
     def continue_from(self, state_dict: dict) -> None:

@@ -1,5 +1,6 @@
 """Optional torch.compile of pure tensor functions: same results to rounding, and never a reason to fail."""
 
+import functools
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -13,19 +14,18 @@ class Compiled:
 
     Args:
         function: tensors in, as positional arguments, tensors out.
+        dynamic: once for any sizes, as a selection's; otherwise for each size anew, to faster code.
     """
 
     warned = False
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
-        self.fast: Callable[..., Any] | None = torch.compile(
-            function, dynamic=True
-        )  # the shield's rounds are of any size
+    def __init__(self, function: Callable[..., Any], *, dynamic: bool = True) -> None:
+        self.function, self.dynamic = function, dynamic
+        self.fast: Callable[..., Any] | None = torch.compile(function, dynamic=dynamic)
 
-    def __reduce__(self) -> tuple[type, tuple]:
+    def __reduce__(self) -> tuple[Callable, tuple]:
         """Copies and pickles compile anew."""
-        return Compiled, (self.function,)
+        return functools.partial(Compiled, dynamic=self.dynamic), (self.function,)
 
     def __call__(self, *tensors: Tensor) -> Any:
         """The function's result, to rounding."""
@@ -43,6 +43,6 @@ class Compiled:
         return self.function(*tensors)
 
 
-def compiled(function: Callable[..., Any], *, enabled: bool) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], *, enabled: bool, dynamic: bool = True) -> Callable[..., Any]:
     """``function``, or its :class:`Compiled` form if ``enabled``."""
-    return Compiled(function) if enabled else function
+    return Compiled(function, dynamic=dynamic) if enabled else function

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import length, pair_indices
+from envs.dynamics import length, pair_indices, take
 
 TINY = 1e-30  # below it a length is 0
 
@@ -197,14 +197,14 @@ def _relative_path(position: Tensor, slot_position: Tensor, geometry: HomingGeom
     distance = length(offset)
     direction = (offset / distance.unsqueeze(-1)).movedim(-1, 0)  # (d, *B, N)
     whole = (distance / (geometry.speed * geometry.dt)).floor()
-    n_i, n_j = whole[..., i], whole[..., j]
+    n_i, n_j = take(whole, i), take(whole, j)
     first, last = torch.minimum(n_i, n_j), torch.maximum(n_i, n_j)
     times = torch.stack([torch.zeros_like(first), first, first + 1, torch.maximum(last, first + 1), last + 1])
     slots = slot_position.movedim(-1, 0)
-    way_i = direction[..., i] * _to_go(distance[..., i], n_i, times, geometry).unsqueeze(1)
-    way_j = direction[..., j] * _to_go(distance[..., j], n_j, times, geometry).unsqueeze(1)
+    way_i = take(direction, i) * _to_go(take(distance, i), n_i, times, geometry).unsqueeze(1)
+    way_j = take(direction, j) * _to_go(take(distance, j), n_j, times, geometry).unsqueeze(1)
     # in this order and with no fused product, two robots that mirror each other keep an offset of exactly 0
-    return times, (slots[..., i] - slots[..., j]) + (way_i - way_j)
+    return times, (take(slots, i) - take(slots, j)) + (way_i - way_j)
 
 
 def _to_go(distance: Tensor, whole: Tensor, times: Tensor, geometry: HomingGeometry) -> Tensor:

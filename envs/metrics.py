@@ -47,9 +47,14 @@ def violations(
 
 
 @functools.lru_cache(maxsize=64)
-def _pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _made_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j
+
+
+@torch.compiler.assume_constant_result
+def _pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    return _made_pairs(n_agents, device)
 
 
 def _length(x: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from envs.config import SurveillanceConfig
 from envs.density import Density
-from envs.dynamics import other_indices
+from envs.dynamics import other_indices, take
 
 
 def observation_fields(config: SurveillanceConfig, density: Density) -> dict[str, slice]:
@@ -72,14 +72,14 @@ def observe(
     length, robots = config.length_scale, energy.shape
     others = other_indices(config.n_agents, position.device)
     share = (energy - config.energy_min) / (config.energy_max - config.energy_min)
-    relative = position[:, others] - position.unsqueeze(-2)  # (B, N, N-1, d)
+    relative = take(position, others, 1) - position.unsqueeze(-2)  # (B, N, N-1, d)
     fields = [
         (position - middle) / length,
         share.unsqueeze(-1),
         (slot_position - position) / length,
         torch.flatten(stations - position.unsqueeze(-2), -2) / length,
         torch.flatten(relative, -2) / length,
-        share[:, others],
+        take(share, others),
         seen.unsqueeze(-2).expand(*robots, -1),
     ]
     if config.horizon:

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from envs.dynamics import dot, length, pair_indices
 from envs.homing import HomingGeometry, is_certified, reserve
+from envs.selection import places
 
 EXCHANGES = 4  # exchanges of slots whose certificate is tried in a step
 
@@ -59,26 +60,36 @@ def best_exchanges(
 
 
 def reassign_slots(
-    position: Tensor, energy: Tensor, slot: Tensor, slots: Tensor, geometry: HomingGeometry, bounds: Tensor
+    position: Tensor,
+    energy: Tensor,
+    slot: Tensor,
+    slots: Tensor,
+    geometry: HomingGeometry,
+    bounds: Tensor,
+    *,
+    fixed_sizes: bool = False,
 ) -> Tensor:
     """Adopt the best of a few exchanges under which the state is certified, none where there is no such (docs/safety.md, 9).
 
-    Args and shapes as :func:`best_exchanges`; ``bounds`` ``(d, 2)`` is the arena.
+    Args and shapes as :func:`best_exchanges`; ``bounds`` ``(d, 2)`` is the arena; ``fixed_sizes`` looks at all worlds and
+    exchanges, with the same results (:mod:`envs.selection`).
 
     Returns:
         ``(*B, N)`` int64, one-to-one.
     """
     n, d = position.shape[-2:]
     flat = position.reshape(-1, n, d), energy.reshape(-1, n), slot.reshape(-1, n)
-    index = _may_exchange(flat[0], flat[2], slots).nonzero().squeeze(-1)
+    (index,) = places(_may_exchange(flat[0], flat[2], slots), fixed_sizes=fixed_sizes)
     some_position, some_energy, some_slot = (x[index] for x in flat)
     count = min(EXCHANGES, slot.shape[-1] * len(slots))
     candidates = best_exchanges(some_position, some_energy, some_slot, slots, geometry, count)
     # few kinds of exchange have anything to offer
-    some = (candidates != some_slot.unsqueeze(-2)).any(dim=-1).nonzero(as_tuple=True)
-    adopt = torch.zeros(candidates.shape[:-1], dtype=torch.bool, device=slot.device)
+    differs = (candidates != some_slot.unsqueeze(-2)).any(dim=-1)
+    some = places(differs, fixed_sizes=fixed_sizes)
+    adopt = torch.zeros_like(differs)
     home = slots[candidates[some]]
     adopt[some] = is_certified(some_position[some[0]], some_energy[some[0]], home, geometry, bounds)
+    adopt = adopt & differs
     first = adopt.to(torch.uint8).argmax(dim=-1, keepdim=True)
     chosen = candidates.gather(-2, first.unsqueeze(-1).expand(*first.shape, slot.shape[-1])).squeeze(-2)
     chosen = torch.where(adopt.any(dim=-1, keepdim=True), chosen, some_slot)

@@ -42,6 +42,8 @@ class SurveillanceEnv(EnvBase):
         seed: seed of the environment's own random generator. Several seeds split the worlds into that many equal blocks with a
             generator each (:mod:`envs.blocks`).
         compile_functions: run transition and violation counting through torch.compile; same results to rounding.
+        fixed_sizes: let no size in a step depend on the data (:mod:`envs.selection`), so that the host of a GPU waits only
+            where a world may be done: never within an episode with ``on_violation=continue``. The same results, slower on a CPU.
 
     Raises:
         ValueError: if ``num_envs < 1``, or no multiple of the number of seeds.
@@ -55,6 +57,7 @@ class SurveillanceEnv(EnvBase):
         seed: int | Sequence[int] | None = 0,
         *,
         compile_functions: bool = False,  # TorchRL takes the word compile for itself: all of a step, TensorDicts too
+        fixed_sizes: bool = False,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
@@ -65,6 +68,7 @@ class SurveillanceEnv(EnvBase):
         device = torch.device(device or "cpu")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = config
+        self.fixed_sizes = fixed_sizes
         self.geometry = config.homing
         factory = {"dtype": config.torch_dtype, "device": device}
         self.density = Density(config, device)
@@ -81,6 +85,8 @@ class SurveillanceEnv(EnvBase):
             if own is not None:
                 block.generator.manual_seed(own)
         self._continues = False
+        self.sure_steps = 0.0
+        """Steps that every world takes for sure before its episode may end, 0 if not known."""
         self.state = self._blank_state()
         self._write_start(torch.ones(num_envs, dtype=torch.bool, device=device))
 
@@ -89,11 +95,23 @@ class SurveillanceEnv(EnvBase):
         if seed is not None:
             self._only_block().generator.manual_seed(seed)
 
+    def any_done(self, tensordict: TensorDictBase) -> bool:
+        """As TorchRL's, without asking the device where no world can be done (``on_violation=continue``)."""
+        if self.sure_steps > 0:
+            return False
+        if bool(tensordict["done"].any()):
+            return super().any_done(tensordict)
+        if self.config.on_violation == "continue":
+            left = self.config.horizon - self.state["step"].max() if self.config.horizon else float("inf")
+            self.sure_steps = float(left)
+        return False
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.full(self.batch_size, not self._continues, device=self.device)
             self._continues = False
+        self.sure_steps = 0.0
         self._write_start(mask.reshape(self.batch_size))
         out = self._outputs(*self._watch(self.state["position"], self.state["density"], advance=False))
         for kind in keys.VIOLATION_KINDS:
@@ -115,7 +133,9 @@ class SurveillanceEnv(EnvBase):
         watched = self._watch(next_position, state["density"], advance=True)
         slot = state["slot"]
         if config.reassign_slots:
-            slot = reassign_slots(next_position, next_energy, slot, self.slots, self.geometry, self.bounds)
+            limits = (self.slots, self.geometry, self.bounds)
+            slot = reassign_slots(next_position, next_energy, slot, *limits, fixed_sizes=self.fixed_sizes)
+        self.sure_steps -= 1
         self.state = TensorDict(
             {
                 "position": next_position,

@@ -19,12 +19,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from envs.dynamics import length, limit_speed, own_pairs, pair_indices
+from envs.dynamics import length, limit_speed, own_pairs, pair_indices, take
 from envs.homing import (
     TINY,
     ClosestMoments,
     HomingGeometry,
     certified_pairs,
+    certified_parts,
     certified_robots,
     closest_approach,
     closest_moments,
@@ -99,6 +100,8 @@ def anchors(
     slack: Tensor,
     geometry: HomingGeometry,
     max_speed: float,
+    *,
+    fixed_sizes: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Joint action that satisfies all rows on C, and what it leaves of the pairs' slack.
 
@@ -116,6 +119,7 @@ def anchors(
         slack: ``(K, E)``, slack of both standing still.
         geometry: constants of the backup motion.
         max_speed: m/s.
+        fixed_sizes: take all rounds that may be needed.
 
     Returns:
         Anchor ``(M, N, d)`` m/s and the slack it leaves ``(K, E)``.
@@ -134,11 +138,13 @@ def anchors(
         both = torch.stack([chosen[world, i].mT, chosen[world, j].mT])  # (2, d, E)
         left = slack - (normals * both).sum((1, 2))
         tight = (left < 0).any(dim=0) & ~(moving[world, i] & moving[world, j])
-        index = tight.nonzero().squeeze(-1)
-        if not len(index):
+        if not fixed_sizes and not bool(tight.any()):
             break
-        moving = moving.clone()
-        moving[world[index], i[index]] = moving[world[index], j[index]] = True
+        both = (torch.cat([world, world]), torch.cat([i, j]))
+        pulled = torch.zeros_like(moving, dtype=slack.dtype).index_put(
+            both, tight.to(slack.dtype).repeat(2), accumulate=True
+        )
+        moving = moving | (pulled > 0)
     return chosen, left
 
 
@@ -164,6 +170,7 @@ def shield(
     bounds: Tensor,
     *,
     max_speed: float,
+    fixed_sizes: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Raise actions from the program's to hold to driving home until the next state is certified.
 
@@ -172,6 +179,9 @@ def shield(
     ends within ``2 N + 1`` rounds; from a certified state with every robot driving home all certificates hold, so it
     ends with all of them true. ``G`` changes by no more than the two robots move (it is 1-Lipschitz in each position),
     so pairs with ``G >= Delta_G + eps + 2 max_speed dt`` need not be looked at.
+
+    With ``fixed_sizes`` there is one round for all worlds, and where a certificate fails all robots of that world drive home:
+    the last of the other way's rounds at once.
 
     Args:
         step: the environment's own transition, ``(position, energy, velocity, current) -> (position, energy)``.
@@ -185,6 +195,7 @@ def shield(
         geometry: constants of the backup motion.
         bounds: ``(d, 2)``, the arena, m.
         max_speed: m/s.
+        fixed_sizes: see above.
 
     Returns:
         Action ``(M, N, d)`` m/s, level ``(M, N)`` int64 and rounds needed ``(M,)`` int64.
@@ -196,6 +207,12 @@ def shield(
     home = limit_speed(homing_velocity(position, slot_position, geometry), max_speed)
     home = torch.where(home.isfinite(), home, 0.0)
     chosen = _by_level(action, home, level)
+    if fixed_sizes:
+        after, next_energy = step(position, energy, chosen.detach(), current)
+        robots, near = certified_parts(after, next_energy, slot_position, geometry, bounds, margins=1)
+        kept = robots.all(dim=-1, keepdim=True) & near.all(dim=-1, keepdim=True)
+        level = torch.where(kept, level, HOMING)
+        return _by_level(action, home, level), level, rounds + 1
     reach = geometry.clearance + geometry.eps_distance + 2 * max_speed * geometry.dt
     worlds, near = (~(closest >= reach)).nonzero(as_tuple=True)
     members = pairs[near]  # (K, 2)
@@ -228,7 +245,7 @@ def pair_minimum(pairs: Tensor, n: int) -> Tensor:
     """Least value of the pairs that a robot belongs to: ``(M, P)`` to ``(M, N)``, +inf for a single robot."""
     if n == 1:
         return pairs.new_full((len(pairs), 1), torch.inf)
-    return pairs[:, own_pairs(n, pairs.device)[0]].amin(dim=-1)
+    return take(pairs, own_pairs(n, pairs.device)[0]).amin(dim=-1)
 
 
 def _by_level(action: Tensor, home: Tensor, level: Tensor) -> Tensor:
@@ -238,4 +255,4 @@ def _by_level(action: Tensor, home: Tensor, level: Tensor) -> Tensor:
 
 def _either(pairs: Tensor, n: int) -> Tensor:
     """Robots that belong to a marked pair: ``(M, P)`` bool to ``(M, N)`` bool."""
-    return pairs[:, own_pairs(n, pairs.device)[0]].any(dim=-1)
+    return take(pairs, own_pairs(n, pairs.device)[0]).any(dim=-1)

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot, length, own_pairs, pair_indices
+from envs.dynamics import dot, length, own_pairs, pair_indices, take
 from envs.homing import TINY, ClosestMoments, ClosestPieces, HomingGeometry, closest_pieces, way_to_go
+from envs.selection import places
 from safety.certificate import anchors, from_slot, own_gradient, pair_gradients
 from safety.config import Gains
 
@@ -18,7 +19,9 @@ class Rows(NamedTuple):
     """Constraints ``G u <= h`` of K robots' own programs, and the joint action that they are centred on."""
 
     robots: Tensor
-    """Which robots, as places in ``(M N,)``, ``(K,)`` int64: those whose target may violate a row."""
+    """Which robots, as places in ``(M N,)``, ``(K,)`` int64: those whose target may violate a row, or all."""
+    pressed: Tensor
+    """Whether its target may violate a row, ``(K,)`` bool."""
     G: Tensor
     """``(K, m, d)``."""
     h: Tensor
@@ -44,6 +47,7 @@ def certified_rows(
     max_speed: float,
     anchored: bool = True,
     target: Tensor | None = None,
+    fixed_sizes: bool = False,
 ) -> Rows:
     """Rows of the robots' programs: survivability, collision and certificate shared around the anchor, arena.
 
@@ -64,6 +68,7 @@ def certified_rows(
         max_speed: m/s.
         anchored: False centres the rows on standing still, the literature's split by halves (may be infeasible).
         target: ``(M, N, d)`` in the speed ball, m/s: robots whose target satisfies all their rows get none. All, if None.
+        fixed_sizes: every robot gets all its rows, whatever the target (:mod:`envs.selection`).
 
     Returns:
         ``m <= 1 + (N - 1) (1 + S) + 2 d`` rows per robot, S = 4 pieces (linear family) or 1 (logarithmic): pairs' rows
@@ -85,10 +90,10 @@ def certified_rows(
     pieces = ClosestPieces(*(torch.cat([x.unsqueeze(0), y]) for x, y in zip(present, pieces, strict=True)))
     anchor = torch.zeros_like(position)
     critical = (chord_bound < 0).any(dim=-1, keepdim=True)
-    if anchored and bool(critical.any()):  # elsewhere all may stand: their slack is not negative
+    if anchored and (fixed_sizes or bool(critical.any())):  # elsewhere all may stand: their slack is not negative
         # no anchor uses up more than twice the limit; beyond six times it what is left holds for every action
         near = critical & (slack.amin(dim=0) < 6 * max_speed)
-        world, pair = near.nonzero(as_tuple=True)
+        world, pair = places(near, fixed_sizes=fixed_sizes)
         members = (world, i[pair], j[pair])
         e, way = from_slot(position, slot_position)
         e = torch.stack([e[world, x].mT for x in members[1:]])  # (2, d, E)
@@ -98,23 +103,24 @@ def certified_rows(
             pieces.distance[:, world, pair], pieces.relative[:, :, world, pair], *way_to_go(way, time, geometry)
         )
         arguments = (chord_normal, chord_bound, position, slot_position, members, -pair_gradients(moments, e))
-        anchor, left = anchors(*arguments, slack[:, world, pair], geometry, max_speed)
+        spare = torch.where(near, slack, torch.inf)[:, world, pair]
+        anchor, left = anchors(*arguments, spare, geometry, max_speed, fixed_sizes=fixed_sizes)
         slack = torch.where(critical & ~near, slack - 2 * max_speed, slack)
-        slack[:, world, pair] = left
+        slack[:, world, pair] = torch.where(near[world, pair], left, slack[:, world, pair])
     room = torch.cat([bounds[:, 1] - position, position - bounds[:, 0]], dim=-1).clamp_min(0) / geometry.dt
     if target is None:
-        robots = torch.arange(position.shape[0] * n, device=device)
+        pressed = torch.ones_like(chord_bound, dtype=torch.bool).flatten()
     else:
-        robots = (
-            _pressed(target, anchor, chord_normal, chord_bound, slack, room, max_speed).flatten().nonzero().squeeze(-1)
-        )
+        pressed = _pressed(target, anchor, chord_normal, chord_bound, slack, room, max_speed).flatten()
+    (robots,) = places(pressed, fixed_sizes=fixed_sizes or target is None)
     arguments = (position, slot_position, anchor, chord_normal, chord_bound, room)
     *own, chord_normal, chord_bound, room = (x.flatten(0, 1)[robots] for x in arguments)
-    normals, shares = _own_rows(pieces, slack, n, robots, *own, geometry, max_speed)
+    normals, shares = _own_rows(pieces, slack, n, robots, *own, geometry, max_speed, fixed_sizes=fixed_sizes)
     walls = torch.eye(d, dtype=position.dtype, device=device)
     walls = torch.cat([walls, -walls]).expand(len(robots), 2 * d, d)
     return Rows(
         robots=robots,
+        pressed=pressed[robots],
         G=torch.cat([chord_normal.unsqueeze(1), normals, walls], dim=1),
         h=torch.cat([chord_bound.unsqueeze(-1), shares, room], dim=-1),
         anchor=anchor,
@@ -138,7 +144,7 @@ def _pressed(
     fine = dot(chord_normal, target) + HAIR * length(chord_normal) * max_speed <= chord_bound
     fine = fine & (torch.cat([target, -target], dim=-1) + HAIR * max_speed <= room).all(dim=-1)
     if n > 1:
-        least = slack.amin(dim=0)[:, own_pairs(n, target.device)[0]].amin(dim=-1)
+        least = take(slack.amin(dim=0), own_pairs(n, target.device)[0]).amin(dim=-1)
         # the normals are no longer than 1
         fine = fine & (2 * (1 + HAIR) * length(away) <= least)
     return ~fine
@@ -154,6 +160,8 @@ def _own_rows(
     anchor: Tensor,
     geometry: HomingGeometry,
     max_speed: float,
+    *,
+    fixed_sizes: bool,
 ) -> tuple[Tensor, Tensor]:
     """The K robots' halves of the rows of their pairs, without those that no action in the speed ball can reach.
 
@@ -167,6 +175,7 @@ def _own_rows(
         anchor: ``(K, d)``, m/s.
         geometry: constants of the backup motion.
         max_speed: m/s.
+        fixed_sizes: all R rows for every robot, with bound +inf where it does not need them.
 
     Returns:
         Normals ``(K, R, d)`` and bounds ``(K, R)``, m/s; R is the largest number of rows that a robot needs.
@@ -176,9 +185,13 @@ def _own_rows(
     half = slack[:, world.unsqueeze(-1), pair].clamp_min(0).movedim(0, 1).flatten(1) / 2  # (K, (1 + S) (N - 1))
     # the normals are no longer than 1, so any other row holds for every action
     needed = ~(half >= max_speed + length(anchor).unsqueeze(-1))
-    robot, entry = needed.nonzero(as_tuple=True)  # (E,)
-    place = needed.cumsum(dim=1)[robot, entry] - 1
-    count = int(place.max()) + 1 if len(place) else 0
+    robot, entry = places(needed, fixed_sizes=fixed_sizes)  # (E,)
+    if fixed_sizes:
+        half = torch.where(needed, half, torch.inf)
+        place, count = entry, needed.shape[1]
+    else:
+        place = needed.cumsum(dim=1)[robot, entry] - 1
+        count = int(place.max()) + 1 if len(place) else 0
     piece, other = entry // others, entry % others
     where = (world[robot], pair[robot, other])
     e, way = from_slot(position, slot_position)

@@ -92,6 +92,17 @@ class SafetyConfig:
                 "choose safety.solver=active_set or safety.split=half."
             )
 
+    def check_sizes(self, *, fixed_sizes: bool) -> None:
+        """Raise a ``ValueError`` if the filter cannot work at fixed sizes and is asked to."""
+        if not fixed_sizes or self.mode in ("dalal", "none"):
+            return
+        if self.split == "joint" or self.solver not in ("auto", "exact"):
+            raise ValueError(
+                f"fixed_sizes=true needs the exact solver and a problem per robot: safety.split={self.split} "
+                f"safety.solver={self.solver} iterate until all problems are solved. Set safety.split=auto "
+                "safety.solver=auto, or fixed_sizes=false."
+            )
+
     def gains(self, world: SurveillanceConfig) -> Gains:
         """The gains in this world, 1/s.
 

@@ -63,19 +63,27 @@ class SafetyFilter(TensorDictModuleBase):
     Args:
         safety: which filter.
         world: the world it stands in.
-        compile: run the transition that the shield checks through torch.compile; same results to rounding.
+        compile: torch.compile of the shield's transition, with ``fixed_sizes`` of the whole filter; same to rounding.
+        fixed_sizes: compute everything for all robots, so that no size depends on the data and the host of a GPU never waits.
+            Slower on a CPU; the same results, but where a problem has no closed form within tolerance (it counts as
+            INACCURATE, infeasible ones too) and where a certificate fails (all robots of that world drive home).
 
     The position's type and device are the filter's; other inputs are converted to its type.
 
     Raises:
-        ValueError: if a gain does not fit the world's time step, or the world's certificate.
+        ValueError: if a gain does not fit the world's time step, or the world's certificate, or if ``fixed_sizes`` meets
+            another solver than the exact one.
         KeyError: from ``forward``, if an input key is missing.
     """
 
-    def __init__(self, safety: SafetyConfig, world: SurveillanceConfig, *, compile: bool = False) -> None:
+    def __init__(
+        self, safety: SafetyConfig, world: SurveillanceConfig, *, compile: bool = False, fixed_sizes: bool = False
+    ) -> None:
         super().__init__()
+        safety.check_sizes(fixed_sizes=fixed_sizes)
         self.safety = safety
         self.world = world
+        self.fixed_sizes = fixed_sizes
         self.gains = safety.gains(world)
         self.literal = literal_geometry(world)
         self.geometry = world.homing
@@ -87,7 +95,8 @@ class SafetyFilter(TensorDictModuleBase):
         ]
         if safety.mode == "certified":
             self.out_keys.append(keys.BARRIER_CERTIFICATE)
-        self._transition = compiled(functools.partial(transition, config=world), enabled=compile)
+        self._transition = compiled(functools.partial(transition, config=world), enabled=compile and not fixed_sizes)
+        self._filter = compiled(self.filter, enabled=compile and fixed_sizes, dynamic=False)
         self.layer = DalalLayer(safety, world) if safety.mode == "dalal" else None
         self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
 
@@ -100,7 +109,7 @@ class SafetyFilter(TensorDictModuleBase):
                 f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}."
             )
         nominal, position, energy, slot = inputs
-        outputs = self.filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
+        outputs = self._filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)
         return tensordict
@@ -138,7 +147,7 @@ class SafetyFilter(TensorDictModuleBase):
                 solve = self.layer or self._program
                 action, current, status, residual = solve(target, position, energy, slot, h_c, h_o, h_s)
                 status = torch.where(finite, status, int(QPStatus.INACCURATE))
-                hold = status != QPStatus.SOLVED
+                hold = status != QPStatus.SOLVED.value
                 action = torch.where(hold.unsqueeze(-1), 0.0, action)
                 level = hold.to(torch.int64)
         # the gradient of the norm at 0 is 0, not NaN
@@ -178,17 +187,19 @@ class SafetyFilter(TensorDictModuleBase):
             max_speed=world.max_speed,
             anchored=self.safety.split != "half",
             target=target.detach(),
+            fixed_sizes=self.fixed_sizes,
         )
         action, status, residual = self._solve_pressed(target, rows)
         action = limit_speed(action, world.max_speed)  # as the environment will: the shield trusts no solver
         status = torch.where(finite, status, int(QPStatus.INACCURATE))
         beyond = outside(position, energy, home, rows.closest, geometry, bounds)
-        level = torch.where(status == QPStatus.SOLVED, 0, HOLD)
+        level = torch.where(status == QPStatus.SOLVED.value, 0, HOLD)
         level = torch.where(beyond, HOMING, level)
         action, level, _ = shield(
             lambda *state: self._transition(*state, stations),
             *(position, energy, home, action, flat_current, level, rows.closest, geometry, bounds),
             max_speed=world.max_speed,
+            fixed_sizes=self.fixed_sizes,
         )
         least = pair_minimum(torch.cat([rows.closest, rows.distance]), shape[-2])
         closest, distance = least[: len(energy)], least[len(energy) :]
@@ -252,7 +263,11 @@ class SafetyFilter(TensorDictModuleBase):
         m, n, d = target.shape
         status, residual = torch.zeros(m * n, dtype=torch.int64, device=target.device), target.new_zeros(m * n)
         action = target.reshape(-1, d)
-        if len(rows.robots):
+        if self.fixed_sizes:  # all robots, in order
+            solution, status, residual = self._solve_per_robot(action, rows.G, rows.h)
+            action = torch.where(rows.pressed.unsqueeze(-1), solution, action)
+            status, residual = torch.where(rows.pressed, status, 0), torch.where(rows.pressed, residual, 0.0)
+        elif len(rows.robots):
             solution = self._solve_per_robot(action[rows.robots], rows.G, rows.h)
             action = action.index_copy(0, rows.robots, solution[0])
             status[rows.robots], residual[rows.robots] = solution[1], solution[2]
@@ -269,7 +284,7 @@ class SafetyFilter(TensorDictModuleBase):
             solution = solve_qp(identity, -target, G, h, solver=self.safety.solver)
         else:
             # half of limit_speed's hair: cut targets stay as they are, and rounding stays inside the ball
-            solution = project_halfspaces_ball(target, G, h, radius * (1 - 5e-7))
+            solution = project_halfspaces_ball(target, G, h, radius * (1 - 5e-7), fixed_sizes=self.fixed_sizes)
         return solution.value, solution.status, solution.residual
 
     def _solve_joint(

@@ -7,7 +7,7 @@ g = 0, h = 1.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -58,6 +58,14 @@ class Raw(NamedTuple):
         """Write `part` into the samples `index`, in place."""
         for mine, theirs in zip(self, part, strict=True):
             mine[index] = theirs
+
+
+Parts = TypeVar("Parts", bound=NamedTuple)
+
+
+def choose(mask: Tensor, yes: Parts, no: Parts) -> Parts:
+    """Of two results for the same batch ``(B, ..)``, ``yes`` where ``mask`` ``(B,)`` is true."""
+    return yes._make(torch.where(mask.view(-1, *[1] * (x.dim() - 1)), x, y) for x, y in zip(yes, no, strict=True))
 
 
 def norm(x: Tensor) -> Tensor:

@@ -110,7 +110,9 @@ def solve_qp(
     return _solve(Q, p, G, h, radius, solver)
 
 
-def project_halfspaces_ball(target: Tensor, G: Tensor, h: Tensor, radius: float) -> QPSolution:
+def project_halfspaces_ball(
+    target: Tensor, G: Tensor, h: Tensor, radius: float, *, fixed_sizes: bool = False
+) -> QPSolution:
     """Nearest point to `target` with G u ≤ h and ‖u‖ ≤ radius, by the exact solver.
 
     A target that already satisfies everything comes back bit for bit, with an identity gradient.
@@ -120,6 +122,8 @@ def project_halfspaces_ball(target: Tensor, G: Tensor, h: Tensor, radius: float)
         G: (*B, m, n).
         h: (*B, m), +inf for no constraint.
         radius: radius of the ball, unit of u.
+        fixed_sizes: let no size depend on the data, so that a GPU's host never waits: without the enumeration, so that what
+            the closed forms do not solve to `KKT_TOL`, problems without solution among them, is INACCURATE. Backward waits.
 
     Returns:
         The solution, differentiable in target, G and h.
@@ -131,10 +135,12 @@ def project_halfspaces_ball(target: Tensor, G: Tensor, h: Tensor, radius: float)
         raise ValueError("radius must be given")
     if target.ndim < 1:
         raise ValueError(f"target must be (*B, n), got {tuple(target.shape)}")
-    return _solve(None, -target, G, h, radius, "exact")
+    return _solve(None, -target, G, h, radius, "exact", fixed_sizes)
 
 
-def _solve(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, solver: str) -> QPSolution:
+def _solve(
+    Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, solver: str, fixed_sizes: bool = False
+) -> QPSolution:
     """Check what both public functions share, flatten the batch, solve, restore the batch shape."""
     n = p.shape[-1]
     if n < 1 or (solver == "exact" and n > 3):
@@ -163,8 +169,23 @@ def _solve(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | No
         tail = x.shape[x.ndim - trailing :]
         return x.expand(*batch, *tail).reshape(math.prod(batch), *tail)
 
-    outputs = _SolveQP.apply(None if Q is None else flat(Q, 2), flat(p, 1), flat(G, 2), flat(h, 1), radius, solver)
+    matrix = None if Q is None else flat(Q, 2)
+    outputs = _SolveQP.apply(matrix, flat(p, 1), flat(G, 2), flat(h, 1), radius, solver, fixed_sizes)
     return QPSolution(*(x.reshape(batch + x.shape[1:]) for x in outputs))
+
+
+def _solve_fixed(p: Tensor, G: Tensor, h: Tensor, radius: float) -> Raw:
+    """:func:`_solve_flat` of a projection at fixed sizes; samples with non-finite input take part as harmless ones."""
+    tol, (p, G, h) = KKT_TOL[p.dtype], (p.double(), G.double(), h.double())
+    good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
+    p, G, h = (
+        torch.where(good[:, None], p, 0.0),
+        torch.where(good[:, None, None], G, 0.0),
+        torch.where(good[:, None], h, 1.0),
+    )
+    raw = solve_exact(None, p, G, h, radius, tol, fixed_sizes=True)
+    status = torch.where(good, raw.status, QPStatus.INACCURATE.value)
+    return raw._replace(status=status, residual=torch.where(good, raw.residual, torch.inf))
 
 
 def _solve_flat(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, solver: str) -> Raw:
@@ -210,10 +231,17 @@ class _SolveQP(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, solver: str
+        ctx: Any,
+        Q: Tensor | None,
+        p: Tensor,
+        G: Tensor,
+        h: Tensor,
+        radius: float | None,
+        solver: str,
+        fixed_sizes: bool,
     ) -> tuple[Tensor, ...]:
         """Solve and remember the solution in float64."""
-        raw = _solve_flat(Q, p, G, h, radius, solver)
+        raw = _solve_fixed(p, G, h, radius) if fixed_sizes else _solve_flat(Q, p, G, h, radius, solver)
         value, top = raw.u.to(p.dtype), torch.finfo(p.dtype).max
         lost = ~value.isfinite().all(-1)  # overflow, in float64 or on the way back to float32
         value = torch.where(lost[:, None], 0.0, value)
@@ -232,7 +260,7 @@ class _SolveQP(torch.autograd.Function):
         rows_too = ctx.needs_input_grad[2] or ctx.needs_input_grad[3]
         identity = Q is None or _is_identity(Q)
         result = differentiate(Q, p, G, u, lam, mu, solved, grads[0], KKT_TOL[p.dtype], identity, rows_too)
-        return *result, None, None
+        return *result, None, None, None
 
 
 def _step_to_boundary(v: Tensor, dv: Tensor) -> Tensor:

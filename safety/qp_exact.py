@@ -19,11 +19,13 @@ from torch import Tensor
 
 from envs.dynamics import batch_last, dot
 from safety.enumeration import CHUNK_BYTES, enumerate_projection, enumerate_reachable
-from safety.kkt import TINY, QPStatus, Raw, kkt_residual, norm, normalise_rows, pivoted_basis
+from safety.kkt import TINY, QPStatus, Raw, choose, kkt_residual, norm, normalise_rows, pivoted_basis
 from safety.projection import Projected, nearest_on_lines, nearest_on_one_row
 
 FAST_TOL = 1e-11
 """KKT residual (relative) up to which the solution of the short way stands; above it the sample is enumerated."""
+NEAREST_ROWS = 12
+"""Rows of a sample that the short ways look at where sizes are fixed; more within reach are rare (docs/results.md)."""
 ROOT_ITERATIONS = 80
 """Most steps of the search for the ball multiplier; 4 to 8 are usual."""
 
@@ -41,7 +43,9 @@ def settle(raw: Raw, violation: Tensor, nearest: Tensor, radius: float | None, t
     return raw._replace(u=u, status=status, lam=lam.clamp(min=0.0), mu=torch.where(solved, raw.mu, 0.0))
 
 
-def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+def solve_projection(
+    t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float, *, fixed_sizes: bool = False
+) -> Raw:
     """Exact projection; targets that are feasible are returned as they are.
 
     Args:
@@ -50,11 +54,14 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
         h: (B, m) bounds, +inf allowed.
         radius: ball radius or None.
         tol: KKT tolerance.
+        fixed_sizes: all samples take the short ways, and what these do not settle to ``tol`` is INACCURATE.
     """
     raw, m = Raw.blank(t, G.shape[1]), G.shape[1]
     outside = (dot(G, t[:, None]) > h).any(-1)
     if radius is not None:
         outside = outside | (dot(t, t).sqrt() > radius)
+    if fixed_sizes:
+        return choose(outside, _short_ways(t, G, h, radius, tol), raw)
     index = outside.nonzero()[:, 0]
     if len(index):
         t, G, h = (batch_last(x[index]) for x in (t, G, h))
@@ -74,12 +81,30 @@ def solve_projection(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol:
     return raw
 
 
-def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None) -> Projected:
-    """:func:`nearest_on_lines`, in chunks and without the rows that lie beyond the ball everywhere: they cannot bind."""
+def _short_ways(t: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+    """The most violated row or the rows' lines, both for all samples, with the status that their residual leads to."""
+    m = G.shape[1]
+    t, G, h = (batch_last(x) for x in (t, G, h))
+    G, h, size, impossible = normalise_rows(G, h)
+    on_one_row, done = nearest_on_one_row(t, G, h, radius)
+    u, lam, c = choose(done, on_one_row, _project(t, G, h, radius, fixed_sizes=True))
+    residual = kkt_residual(None, -t, G, h, u, lam, c - 1, radius)
+    residual = torch.where(impossible, torch.inf, residual)
+    one = torch.ones_like(impossible, dtype=torch.int64)
+    raw = Raw(u, (lam / size)[:, :m], c - 1, one, residual, one)
+    return settle(raw, torch.where(impossible, torch.inf, 0.0), u, radius, tol)
+
+
+def _project(t: Tensor, G: Tensor, h: Tensor, radius: float | None, *, fixed_sizes: bool = False) -> Projected:
+    """:func:`nearest_on_lines`, in chunks and without the rows that lie beyond the ball everywhere: they cannot bind.
+
+    At fixed sizes with the ``NEAREST_ROWS`` rows that are nearest to the origin: the residual, of all rows, tells whether
+    that was enough.
+    """
     (B, width, n), all_rows = G.shape, None
     m = width
     if radius is not None:
-        most = max(1, int((h < radius).sum(-1).max()))
+        most = NEAREST_ROWS if fixed_sizes else max(1, int((h < radius).sum(-1).max()))
         if most < m:
             all_rows = h.topk(most, dim=-1, largest=False).indices
             G, h, m = G.gather(1, all_rows[..., None].expand(-1, -1, n)), h.gather(1, all_rows), most
@@ -206,7 +231,9 @@ def solve_general(Q: Tensor, p: Tensor, G: Tensor, h: Tensor, radius: float | No
     return settle(raw, torch.where(impossible, torch.inf, violation), nearest, radius, tol)
 
 
-def solve_exact(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float) -> Raw:
+def solve_exact(
+    Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float | None, tol: float, *, fixed_sizes: bool = False
+) -> Raw:
     """Exact solution, by projection where Q is a multiple of the identity.
 
     Args:
@@ -216,9 +243,10 @@ def solve_exact(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float
         h: (B, m), +inf allowed; everything else finite.
         radius: ball radius, length unit of u, or None.
         tol: KKT tolerance, relative.
+        fixed_sizes: as :func:`solve_projection`'s; for Q None only.
     """
     if Q is None:
-        return solve_projection(-p, G, h, radius, tol)
+        return solve_projection(-p, G, h, radius, tol, fixed_sizes=fixed_sizes)
     c = Q[:, :1, :1]
     ball = c * torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device)
     round_ = ((ball == Q) & (c > 0)).all(-1).all(-1)

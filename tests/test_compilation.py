@@ -42,6 +42,26 @@ def test_compiled_roll_out_is_the_same_to_rounding(world):
     assert not fast[keys.OUTSIDE].any()
 
 
+def test_the_whole_filter_of_fixed_sizes_is_one_graph(world):
+    """Traced without a break; the code for it takes a compiler a minute, which is left to benchmarks and GPU tests."""
+    env, f = SurveillanceEnv(world, 24, seed=3), SafetyFilter(SafetyConfig(), world, fixed_sizes=True)
+    td = make_controller("gather", world)(env.reset())
+    inputs = (td[keys.NOMINAL_ACTION], td[keys.POSITION], td[keys.ENERGY].squeeze(-1), td[keys.SLOT].squeeze(-1))
+    with torch.no_grad():
+        traced = torch.compile(f.filter, backend="eager", fullgraph=True, dynamic=False)(*inputs)
+        for one, other in zip(traced, f.filter(*inputs), strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=1e-12)
+
+
+def test_fixed_sizes_compile_the_filter_and_not_its_parts(world):
+    made = {fixed: SafetyFilter(SafetyConfig(), world, compile=True, fixed_sizes=fixed) for fixed in (False, True)}
+    for fixed, f in made.items():
+        again = copy.deepcopy(f)
+        assert (isinstance(again._filter, Compiled), isinstance(again._transition, Compiled)) == (fixed, not fixed)
+        assert not fixed or again._filter.dynamic is False
+        assert not fixed or again._filter.function.__self__ is again
+
+
 def test_violations_are_counted_when_compiled(world):
     env = SurveillanceEnv(world, 24, compile_functions=True)
     td, seen = env.reset(), 0

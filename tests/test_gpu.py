@@ -24,6 +24,7 @@ from tests.test_synchronisation import MOST
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 CPU = torch.device("cpu")
+FIXED = {"env": SurveillanceConfig(on_violation="continue"), "fixed_sizes": True}
 
 
 def collected(device: str, num_envs: int = 64, steps: int = 20, **settings) -> tuple[TensorDict, Config]:
@@ -32,7 +33,7 @@ def collected(device: str, num_envs: int = 64, steps: int = 20, **settings) -> t
     config.collector.num_envs, config.collector.steps_per_batch = num_envs, steps
     place, n_observation = torch.device(device), SurveillanceEnv(config.env).n_observation
     learners, learner = make_learners(n_observation, config.env, config.agent, config.safety, place, seeds=[0])
-    _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, [0], place)
+    _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, [0], place, **config.computing)
     noises = noises_of(explore)
     collection = make_collection(config, [0], learners, explore, noises, place, print)
     return next(collection.batches(num_envs * steps, resumed=False)), config
@@ -40,7 +41,8 @@ def collected(device: str, num_envs: int = 64, steps: int = 20, **settings) -> t
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("n_agents", [3, 5])
-def test_the_filter_agrees_with_the_processor(device, n_agents):
+@pytest.mark.parametrize("fixed_sizes", [False, True])
+def test_the_filter_agrees_with_the_processor(device, n_agents, fixed_sizes):
     world = SurveillanceConfig(n_agents=n_agents)
     batch, _ = collected(device, env=world)
     assert all(value.device.type == device for value in batch.values(True, True))
@@ -48,8 +50,8 @@ def test_the_filter_agrees_with_the_processor(device, n_agents):
     noise = torch.randn(there[keys.POSITION].shape, generator=torch.Generator().manual_seed(1))
     there[keys.NOMINAL_ACTION] = world.max_speed * noise.to(device)
     here = there.to(CPU)
-    safety_filter = SafetyFilter(SafetyConfig(), world)
-    there, here = safety_filter(there).to(CPU), safety_filter(here)
+    there = SafetyFilter(SafetyConfig(), world, fixed_sizes=fixed_sizes)(there).to(CPU)
+    here = SafetyFilter(SafetyConfig(), world)(here)
     assert ((here[keys.ACTION] - there[keys.ACTION]).norm(dim=-1) <= 1e-3 * world.max_speed).float().mean() > 0.999
     for key in (keys.STATUS, keys.LEVEL):  # a value at a threshold may fall to either side
         assert (here[key] == there[key]).float().mean() > 0.999
@@ -84,16 +86,30 @@ def test_runs(program, tmp_path):
 
 
 @pytest.mark.gpu
-def test_collecting_waits_for_the_device_no_more_often_than_counted_on_a_cpu():
-    collected("cuda", steps=3)
+def test_the_compiled_filter_agrees_with_the_processor():
+    world = SurveillanceConfig()
+    batch, _ = collected("cuda", env=world)
+    there = batch.select(keys.POSITION, keys.ENERGY, keys.SLOT).reshape(-1)
+    there[keys.NOMINAL_ACTION] = world.max_speed * torch.randn_like(there[keys.POSITION])
+    here = SafetyFilter(SafetyConfig(), world)(there.to(CPU))
+    fast = SafetyFilter(SafetyConfig(), world, compile=True, fixed_sizes=True)
+    there = fast(there).to(CPU)
+    assert fast._filter.fast is not None  # pyright: ignore[reportFunctionMemberAccess]  compiled in fact
+    assert ((here[keys.ACTION] - there[keys.ACTION]).norm(dim=-1) <= 1e-3 * world.max_speed).float().mean() > 0.999
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("settings", "most"), [({}, MOST["collect"]), (FIXED, 0)], ids=["", "fixed sizes"])
+def test_collecting_waits_for_the_device_no_more_often_than_counted_on_a_cpu(settings, most):
+    collected("cuda", steps=3, **settings)
     torch.cuda.set_sync_debug_mode("warn")
     try:
         counts = []
         for steps in (10, 30):
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                collected("cuda", steps=steps)
+                collected("cuda", steps=steps, **settings)
             counts.append(sum("synchroniz" in str(warning.message) for warning in caught))
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert (counts[1] - counts[0]) / 20 <= MOST["collect"]
+    assert (counts[1] - counts[0]) / 20 <= most

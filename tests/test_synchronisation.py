@@ -59,14 +59,14 @@ class Readings(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def waits(world: SurveillanceConfig, num_envs: int) -> dict[str, float]:
+def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False) -> dict[str, float]:
     """Waits per iteration of each part of the training loop."""
-    config = Config(env=world)
+    config = Config(env=world, fixed_sizes=fixed_sizes)
     config.collector.num_envs = num_envs
     learners, learner = make_learners(
         SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=[0]
     )
-    _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU)
+    _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU, **config.computing)
     noises = noises_of(explore)
     collection = make_collection(config, [0], learners, explore, noises, CPU, print)
     batches = collection.batches(100 * num_envs, resumed=False)
@@ -107,3 +107,11 @@ def test_waits_of_an_iteration(n_agents, num_envs):
     found = waits(SurveillanceConfig(n_agents=n_agents, horizon=100), num_envs)
     assert all(found[part] <= most for part, most in MOST.items()), found
     assert found["collect"] > 5  # the counting counts
+
+
+@pytest.mark.parametrize(("n_agents", "num_envs"), [(3, 64), (3, 256), (6, 64)])
+@pytest.mark.parametrize(("on_violation", "most"), [("continue", 0), ("terminate", 1)])  # 1: is any world done?
+def test_a_step_of_fixed_sizes_does_not_wait(n_agents, num_envs, on_violation, most):
+    world = SurveillanceConfig(n_agents=n_agents, horizon=100, on_violation=on_violation)
+    found = waits(world, num_envs, fixed_sizes=True)
+    assert found["collect"] == pytest.approx(most), found

@@ -264,10 +264,12 @@ class Record:
     """Which robots the filter solved a program for, in every step (certified only)."""
 
 
-def roll_out(world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, keep_rows=True, **safety_fields):
+def roll_out(
+    world, gains, *, worlds=16, steps=36, seed=0, kinds=KINDS, keep_rows=True, fixed_sizes=False, **safety_fields
+):
     """Run the filter in the world against the adversary, from edge states; ``keep_rows``: with the rows of every robot."""
-    env = SurveillanceEnv(world, worlds, seed=seed)
-    safety_filter = SafetyFilter(SafetyConfig(**{**gains, **safety_fields}), world)
+    env = SurveillanceEnv(world, worlds, seed=seed, fixed_sizes=fixed_sizes)
+    safety_filter = SafetyFilter(SafetyConfig(**{**gains, **safety_fields}), world, fixed_sizes=fixed_sizes)
     position, energy, slot = edge_states(env, seed)
     td = env.set_state(position, energy.unsqueeze(-1), slot.unsqueeze(-1))
     adversary, records, rows, pressed = Adversary(world, seed, kinds), [], [], []

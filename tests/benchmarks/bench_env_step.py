@@ -1,8 +1,9 @@
 """python tests/benchmarks/bench_env_step.py [--batches 512,4096] [--robots 3] [--profile] [--no-memory]
 
 One whole step of B worlds of N robots: filter, world, coverage and observation, with random nominal actions, unfiltered and
-behind the stacked and the certified filter, compiled too where the package offers it. Baseline of the ratio: an unfiltered
-step of VMAS simple_spread with the same B and N, if vmas is installed. Both get actions drawn beforehand; no resets.
+behind the stacked and the certified filter, also compiled (a minute for each size) and at fixed sizes. Baseline of the ratio:
+an unfiltered step of VMAS simple_spread with the same B and N, if vmas is installed. Both get actions drawn beforehand; no
+resets. ``--rows certified`` leaves out all rows whose name does not begin so.
 
 "peak MB" is the peak resident memory of a fresh process that does nothing else, less what it had after its imports (on a GPU
 the peak of its allocator). ``--profile`` adds the share of one certified step's time per part.
@@ -10,7 +11,6 @@ the peak of its allocator). ``--profile`` adds the share of one certified step's
 
 import contextlib
 import importlib
-import inspect
 import resource
 import subprocess
 import sys
@@ -31,8 +31,9 @@ from safety import SafetyFilter
 STEPS = 4  # per timed run
 VMAS, UNFILTERED = "VMAS simple_spread", "unfiltered"
 OURS = {UNFILTERED: "none", "stacked": "stacked", "certified": "certified"}
-COMPILED = ", compiled"
-CAN_COMPILE = "compile_functions" in inspect.signature(SurveillanceEnv.__init__).parameters
+COMPILED, FIXED = ", compiled", ", fixed sizes"
+OURS |= {name + COMPILED: own for name, own in OURS.items()}
+OURS |= {f"certified{FIXED}": "certified", f"certified{FIXED}{COMPILED}": "certified"}
 
 PARTS = {
     "filter: rows": ["safety.filter.certified_rows", "safety.filter.sampled_energy_row"],
@@ -67,11 +68,9 @@ def make_chain(name: str, world: SurveillanceConfig, batch: int, device: str) ->
 
 def our_step(name: str, world: SurveillanceConfig, batch: int, device: str) -> Callable[[], None]:
     """Filter and environment."""
-    fast = name.endswith(COMPILED)
-    env = SurveillanceEnv(world, batch, device, seed=1, **({"compile_functions": True} if fast else {}))
-    policy = SafetyFilter(
-        harness.FILTERS[OURS[name.removesuffix(COMPILED)]], world, **({"compile": True} if fast else {})
-    )
+    fast, fixed = COMPILED in name, FIXED in name
+    env = SurveillanceEnv(world, batch, device, seed=1, compile_functions=fast, fixed_sizes=fixed)
+    policy = SafetyFilter(harness.FILTERS[OURS[name]], world, compile=fast, fixed_sizes=fixed)
     nominal = make_controller("random", world)
     td = env.reset()
     actions = [nominal(td.clone())[keys.NOMINAL_ACTION] for _ in range(STEPS)]
@@ -207,8 +206,8 @@ def print_profile(n: int, batch: int, options) -> None:
 # ---- program --------------------------------------------------------------------------------------------------------
 def rows_of(options, budget: harness.Budget) -> Iterator[list]:
     """Table rows of all sizes."""
-    names = [*([VMAS] if harness.optional("vmas") else []), *OURS]
-    names += [name + COMPILED for name in OURS if CAN_COMPILE]
+    names = [name for name in OURS if name.startswith(options.rows)]
+    names = [VMAS, *names] if harness.optional("vmas") else names
     for n in options.robots:
         world = harness.make_world(n, options.dimension)
         for batch in options.batches:
@@ -233,6 +232,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = harness.make_parser(__doc__, batches="512,4096", robots="3")
     parser.add_argument("--profile", action="store_true", help="share of the certified step's time per part")
     parser.add_argument("--no-memory", dest="memory", action="store_false", help="no fresh processes for the memory")
+    parser.add_argument("--rows", default="", help="only rows whose name begins so, and VMAS")
     parser.add_argument("--child", help="internal: measure this row's memory in this process")
     options = harness.parse(parser, arguments)
     if options.child:
@@ -243,9 +243,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         *("B", "N", "step", "ms", "world-steps/s", "µs per world"),
         *(f"/ {VMAS}", f"/ {UNFILTERED}", "peak MB"),
     )
-    compiled = "" if CAN_COMPILE else "Compiled: not offered by this version of the package."
     unmeasured = "" if options.memory else f"Peak MB {harness.DASH}: switched off by --no-memory."
-    notes = (compiled, unmeasured, harness.missing("vmas"), budget.footnote)
+    notes = (unmeasured, harness.missing("vmas"), budget.footnote)
     harness.table(f"Whole step, d = {options.dimension}", header, rows_of(options, budget), *notes)
     if options.profile:
         for n in options.robots:
