@@ -15,7 +15,7 @@ Lillicrap et al., Continuous control with deep reinforcement learning, arXiv 150
 import functools
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
@@ -74,6 +74,16 @@ class MADDPGLoss(DDPGLoss):
             "target_value": layers_of(self.target_value_network_params[value]),
         }
 
+    @property
+    def reads(self) -> list[NestedKey]:
+        """What :meth:`forward` reads of a minibatch."""
+        state = [keys.POSITION, keys.ENERGY, keys.SLOT] if self.filtered else []
+        both = [keys.OBSERVATION, *state]
+        following = [*both, keys.REWARD, keys.TERMINATED]
+        action = keys.NOMINAL_ACTION if self.nominal else keys.ACTION
+        steps = [STEPS] if self.agent.n_steps > 1 else []
+        return [*both, action, *steps, *(("next", *key) for key in following)]
+
     def __getstate__(self) -> dict:
         """A copy finds its own layers."""
         return {name: value for name, value in super().__getstate__().items() if name != "layers"}
@@ -88,9 +98,8 @@ class MADDPGLoss(DDPGLoss):
             "loss_actor", "loss_value", "pred_value" and "target_value", ``(batch, N)`` each.
         """
         observation, following = tensordict[keys.OBSERVATION], tensordict["next"]
-        action = tensordict[keys.ACTION]
-        if self.nominal:
-            action = limit_speed(tensordict[keys.NOMINAL_ACTION], self.max_speed)
+        action = tensordict[keys.NOMINAL_ACTION if self.nominal else keys.ACTION]
+        action = limit_speed(action, self.max_speed) if self.nominal else action
         value = self.evaluate(self.layers["value"], observation, action, action)
         with torch.no_grad():
             next_action, _ = self.act(self.layers["target_actor"], following)

@@ -10,6 +10,7 @@ from agents.config import AgentConfig
 from agents.foresight import Foresight
 from envs import SurveillanceConfig, keys
 from envs.dynamics import other_indices, take
+from envs.randomness import restore_generator
 from safety import SafetyConfig, SafetyFilter
 
 JOINT_ACTION = ("agents", "joint_action")
@@ -265,7 +266,7 @@ class ExplorationNoise(TensorDictModuleBase):
 
     def set_extra_state(self, state: dict) -> None:
         """Restore what :meth:`get_extra_state` returned."""
-        self.generator.set_state(state["generator"].cpu())
+        restore_generator(self.generator, state["generator"])
         self.frames, process = state["frames"], state["process"]
         self.process = None if process is None else process.to(self.generator.device)
 

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer
 
 from agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from envs.randomness import restore_generator
 
 
 class ReplayFiles:
@@ -85,7 +86,10 @@ class ReplayFiles:
             self.buffer.extend(torch.cat([rows[len(rows) - shift :], rows[: len(rows) - shift]]) if shift else rows)
         content = self.buffer.state_dict()
         writer = {"_cursor": written % capacity, "_write_count": written}
-        self.buffer.load_state_dict(content | {"_writer": content["_writer"] | writer, "_rng": state["rng"]})
+        self.buffer.load_state_dict(content | {"_writer": content["_writer"] | writer, "_rng": None})
+        generator = torch.Generator(device=content["_rng"][1])
+        restore_generator(generator, state["rng"][0])
+        self.buffer.set_rng(generator)
         if source != self.folder:  # of another run: the next checkpoint writes all rows into this one's folder
             return
         self.saved, self.saved_before = written, state["written_before"]

@@ -4,6 +4,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
 from agents.networks import ExplorationNoise
-from agents.pipeline import WaitingSteps, make_buffer
+from agents.pipeline import WaitingSteps, draw, make_buffer
 from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_config import Config
 from agents.training_state import TrainingState, valid_ages
@@ -316,13 +317,13 @@ def minibatches(runs: Sequence[TrainingRun], count: int) -> Iterator[TensorDictB
         samples = [_sample(run, some) if run.error is None else None for run in runs]
         stand_in = next(sample for sample in samples if sample is not None)  # for failed runs, whose networks are lost
         parts = [stand_in if sample is None else sample for sample in samples]
-        for rows in zip(*parts, strict=True):
-            yield rows[0] if len(runs) == 1 else torch.stack(rows)  # pyright: ignore[reportReturnType, reportCallIssue]
+        whole = cast(TensorDictBase, parts[0] if len(runs) == 1 else torch.stack(parts))  # pyright: ignore[reportCallIssue, reportArgumentType]
+        yield from whole.split(runs[0].batch_size, dim=-1)
 
 
-def _sample(run: TrainingRun, count: int) -> Sequence[TensorDictBase]:
+def _sample(run: TrainingRun, count: int) -> TensorDictBase:
     """``count`` minibatches, drawn as one: the same as one after the other, in less time."""
-    return run.buffer.sample(count * run.batch_size).chunk(count)
+    return draw(run.buffer, count * run.batch_size, run.learner.loss.reads)
 
 
 def errors_by_seed(error: Exception, seeds: Iterable[int]) -> dict[int, str]:

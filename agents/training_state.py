@@ -129,7 +129,7 @@ class TrainingState:
         _load_states(self.parts, content["parts"])
         torch.set_rng_state(content["torch"].cpu())
         if content["cuda"] and torch.cuda.is_available():
-            torch.cuda.set_rng_state_all([state.cpu() for state in content["cuda"]])
+            torch.cuda.set_rng_state_all([state.cpu() for state in content["cuda"]][: torch.cuda.device_count()])
         if own:
             later = [other for other in checkpoints(self.folder) if other.name > path.name]
             set_aside(self.folder.parent, later + list(self.folder.parent.glob("summary.json")))

@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from envs.randomness import restore_generator
+
 if TYPE_CHECKING:
     from envs.surveillance import SurveillanceEnv
 
@@ -56,7 +58,7 @@ class WorldBlock:
             value[self.worlds] = given[name].to(value)
             self.env.state[name] = value
         self.env.sure_steps = 0.0
-        self.generator.set_state(state_dict["generator"].cpu())
+        restore_generator(self.generator, state_dict["generator"])
 
     def continue_from(self, state_dict: dict) -> None:
         """:meth:`load_state_dict`, and the next reset of all worlds returns their state instead of drawing start states.

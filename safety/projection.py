@@ -23,7 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from envs.dynamics import dot
+from envs.dynamics import dot, pair_indices
 from safety.kkt import norm
 
 PARALLEL = 1e-11
@@ -68,7 +68,7 @@ def _lines(g: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return one, torch.zeros_like(one), one[0] > 0, rows.new_zeros(1, 0)
     if n == 2:
         return torch.stack([-g[1], g[0]]), h * g, (g[0] != 0) | (g[1] != 0), rows.unsqueeze(-1)
-    pairs = torch.combinations(rows, 2)
+    pairs = torch.stack(pair_indices(len(rows), rows.device), dim=1)
     a, b = g[:, pairs[:, 0]], g[:, pairs[:, 1]]
     e = torch.linalg.cross(a, b, dim=0)
     size = _sum(e, e).sqrt()

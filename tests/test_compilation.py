@@ -42,8 +42,10 @@ def test_compiled_roll_out_is_the_same_to_rounding(world):
     assert not fast[keys.OUTSIDE].any()
 
 
-def test_the_whole_filter_of_fixed_sizes_is_one_graph(world):
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_whole_filter_of_fixed_sizes_is_one_graph(dimension):
     """Traced without a break; the code for it takes a compiler a minute, which is left to benchmarks and GPU tests."""
+    world = SurveillanceConfig(dtype="float64", resolution=3, dimension=dimension)
     env, f = SurveillanceEnv(world, 24, seed=3), SafetyFilter(SafetyConfig(), world, fixed_sizes=True)
     td = make_controller("gather", world)(env.reset())
     inputs = (td[keys.NOMINAL_ACTION], td[keys.POSITION], td[keys.ENERGY].squeeze(-1), td[keys.SLOT].squeeze(-1))

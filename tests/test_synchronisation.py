@@ -15,7 +15,7 @@ from agents.collection import make_collection
 from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies, noises_of
-from agents.pipeline import MultiStep, make_buffer, to_transitions
+from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv
@@ -93,8 +93,8 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
                 buffer.extend(steps)
             spent("store")
         if k >= 8:
-            minibatch = buffer.sample(256)
             with mode, readings:
+                minibatch = draw(buffer, 256, learner.loss.reads)
                 update_step(minibatch, *learner.updates, config.agent)
             spent("update")
             steps = [state["step"] for own in learner.optimizers.values() for state in own.state.values()]
@@ -115,3 +115,8 @@ def test_a_step_of_fixed_sizes_does_not_wait(n_agents, num_envs, on_violation, m
     world = SurveillanceConfig(n_agents=n_agents, horizon=100, on_violation=on_violation)
     found = waits(world, num_envs, fixed_sizes=True)
     assert found["collect"] == pytest.approx(most), found
+
+
+def test_a_step_of_fixed_sizes_does_not_wait_in_space():
+    world = SurveillanceConfig(dimension=3, horizon=100, on_violation="continue")
+    assert waits(world, 16, fixed_sizes=True)["collect"] == 0

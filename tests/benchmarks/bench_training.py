@@ -54,7 +54,7 @@ from agents.incident import check_violations
 from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies, noises_of
-from agents.pipeline import MultiStep, make_buffer, to_transitions, use_threads
+from agents.pipeline import MultiStep, draw, make_buffer, to_transitions, use_threads
 from agents.recorder import Seconds, TrainingRecorder
 from agents.training_config import Config
 from conf.schema import register, to_config
@@ -243,14 +243,14 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
                 buffer.extend(own)
 
     per_batch, updates = n_seeds * config.collector.frames_per_batch, config.train.n_updates
-    drawn: list[tuple[TensorDictBase, ...]] = []
+    drawn: list[TensorDictBase] = []
 
     def sample() -> TensorDictBase:
         if not drawn:  # all of a batch at once, as agents.run.minibatches
-            samples = [buffer.sample(updates * minibatch).chunk(updates) for buffer in buffers]
-            drawn.extend(reversed(list(zip(*samples, strict=True))))
-        rows = drawn.pop()
-        return rows[0] if n_seeds == 1 else torch.stack(rows)
+            samples = [draw(buffer, updates * minibatch, learner.loss.reads) for buffer in buffers]
+            whole = samples[0] if n_seeds == 1 else torch.stack(samples)
+            drawn.extend(reversed(whole.split(minibatch, dim=-1)))
+        return drawn.pop()
 
     batches = collection.batches(10**6 * per_batch, resumed=False)
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
