@@ -7,24 +7,36 @@ everything that needs a number on the host.
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage
 
+from agents import make_controller
 from agents.config import AgentConfig
+from agents.divergence import check_batch
+from agents.evaluation import evaluate_policy
+from agents.incident import check_violations
 from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import ExplorationNoise, make_policies
 from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
+from agents.recorder import TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, keys
+from envs.blocks import WorldBlock
 from envs.density import Density
 from envs.randomness import restore_generator
+from envs.starts import draw_starts
 from safety import SafetyConfig, SafetyFilter
 
 META = torch.device("meta")
 WORLDS = {
     "default": {},
     "five robots in 3-D": {"n_agents": 5, "dimension": 3},
-    "density per world, centroids": {"density": "gaussian_mixture", "density_per_world": True, "observe_centroid": True},
+    "density per world, centroids": {
+        "density": "gaussian_mixture",
+        "density_per_world": True,
+        "observe_centroid": True,
+    },
     "moving density, no episodes": {"density": "moving", "horizon": 0},
 }
 
@@ -53,6 +65,29 @@ class DrawsOnItsDevice(torch.overrides.TorchFunctionMode):
         if generator is not None:
             assert generator.asked.type == out.device.type, func
         return out
+
+
+class ReadsZeros(torch.overrides.TorchFunctionMode):
+    """What the host reads of the stand-in's tensors is true or 0: for code that counts a batch, which has to read."""
+
+    READS = (
+        torch.Tensor.tolist,
+        torch.Tensor.item,
+        torch.Tensor.__bool__,
+        torch.Tensor.__int__,
+        torch.Tensor.__float__,
+    )
+
+    def __init__(self, truth):
+        super().__init__()
+        self.count, self.truth = 0, truth
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if (func in self.READS or func is torch.Tensor.cpu) and args[0].device == META:
+            self.count += 1
+            read = torch.zeros(args[0].shape, dtype=args[0].dtype)
+            args = (read | self.truth if read.dtype == torch.bool else read,)
+        return func(*args, **(kwargs or {}))
 
 
 @pytest.fixture(autouse=True)
@@ -157,6 +192,48 @@ def test_filters(safety):
     )
     with torch.no_grad():
         assert all(out.device == META for out in f.filter(torch.empty(6, 3, 2, device=META), *state))
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_counting_and_checking_a_batch(name, tmp_path):
+    world = world_of(name)
+    batch, _ = roll_out(world, Config(env=world), 3)
+    recorder = TrainingRecorder(world, 4, META)
+    for step in batch.split(1, dim=1):
+        with ReadsZeros(truth=False) as reads:
+            recorder.update(step)
+            check_violations(step, world=world, safety=SafetyConfig(), folder=tmp_path)
+        assert 3 <= reads.count <= 4
+        with ReadsZeros(truth=True):
+            check_batch(step, recorder.frames)
+    assert recorder.frames == 12
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_start_states(name):
+    world = world_of(name)
+    env = moved(SurveillanceEnv(world, 4))
+    generator = AskedGenerator(META)
+    starts = draw_starts(5, world, env.geometry, env.slots, env.bounds, generator)
+    assert all(value.device == META for value in (*starts, env.density.sample(5, generator)))
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_evaluation(name, monkeypatch):
+    world = world_of(name)
+    env = moved(SurveillanceEnv(world, 4, seed=0, fixed_sizes=True))
+    env._device = META
+    monkeypatch.setattr(WorldBlock, "draw_index", lambda self, mask: torch.arange(4, device=META))
+    env.blocks[0].generator = AskedGenerator(META)
+    monkeypatch.setattr(env, "reset", lambda *_: env._reset())
+    monkeypatch.setattr(env, "step", lambda td: td.set("next", env._step(td)))
+    controller = make_controller("lloyd", world)
+    policy = TensorDictSequential(controller, SafetyFilter(SafetyConfig(), world, fixed_sizes=True))
+    with torch.no_grad(), ReadsZeros(truth=False):
+        metrics, statistics, _ = evaluate_policy(env, policy, 3)
+    assert metrics["robot_steps"] == 0  # everything that is read is
+    assert statistics
 
 
 def test_the_stand_in_would_tell():
