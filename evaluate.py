@@ -54,7 +54,6 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    safety.check_sizes(fixed_sizes=config.fixed_sizes)
     computing = {"compile_functions": config.compile, "fixed_sizes": config.fixed_sizes}
     env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, **computing)
     if isinstance(source, Config):
@@ -93,6 +92,7 @@ def main(cfg: DictConfig) -> None:
         "wall_time_s": time.perf_counter() - start,
         **asked,
         "adversary": config.adversary,
+        "fixed_sizes": config.fixed_sizes,
         "git_hash": git_hash(),
         "env": asdict(world),
         "safety": asdict(safety),

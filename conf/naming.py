@@ -80,7 +80,8 @@ def evaluation_folder(cfg: DictConfig) -> str:
         if not any(entry.startswith("env.horizon=") for entry in overrides):
             horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
     name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
-    changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in ("env", "safety", "checkpoint")]
+    names = ("env", "safety", "checkpoint", *(["fixed_sizes"] if cfg.fixed_sizes else []))
+    changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in names]
     if cfg.run is not None:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
         return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")

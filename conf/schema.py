@@ -69,7 +69,10 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
         key = override.split("=")[0].lstrip("+~")
         if key.split(".")[0] in ("env", "safety"):
             OmegaConf.update(given, key, OmegaConf.select(cfg, key), merge=False)
-    given.device = cfg.device  # the run may have been trained elsewhere
+    given.device, given.fixed_sizes = (
+        cfg.device,
+        False,
+    )  # the run may have been trained elsewhere; evaluations have their own
     given.workers = OmegaConf.structured(WorkersConfig)
     return to_config(given)
 
@@ -89,6 +92,8 @@ def check_training(cfg: DictConfig) -> None:
 def check_evaluation(cfg: DictConfig) -> None:
     """Raise what is wrong with an evaluation before anything is written: values, run folder, checkpoint, its world."""
     config = to_config(cfg)
+    source = config if config.run is None else run_config(cfg, list(cfg.hydra.overrides.task))
+    source.safety.check_sizes(fixed_sizes=config.fixed_sizes)
     if config.adversary is not None:
         trained = OmegaConf.load(Path(config.adversary) / ".hydra" / "config.yaml")
         objective = OmegaConf.select(trained, "train.objective")
@@ -100,6 +105,5 @@ def check_evaluation(cfg: DictConfig) -> None:
     if config.controller == "learned":
         make_controller("learned", config.env, adversary=config.adversary)  # its checkpoint and the world's sizes
     if config.run is not None:
-        world = run_config(cfg, list(cfg.hydra.overrides.task)).env
         path = find_checkpoint(Path(config.run), config.checkpoint)
-        check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(world)))
+        check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(source.env)))

@@ -96,10 +96,11 @@ class SurveillanceEnv(EnvBase):
             self._only_block().generator.manual_seed(seed)
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
-        """As TorchRL's, without asking the device where no world can be done (``on_violation=continue``)."""
+        """As TorchRL's, without looking where no episode can have ended (``on_violation=continue``)."""
         if self.sure_steps > 0:
             return False
-        if bool(tensordict["done"].any()):
+        done = tensordict.get("done", None)
+        if done is None or bool(done.any()):
             return super().any_done(tensordict)
         if self.config.on_violation == "continue":
             left = self.config.horizon - self.state["step"].max() if self.config.horizon else float("inf")

@@ -210,7 +210,8 @@ def shield(
     if fixed_sizes:
         after, next_energy = step(position, energy, chosen.detach(), current)
         robots, near = certified_parts(after, next_energy, slot_position, geometry, bounds, margins=1)
-        kept = robots.all(dim=-1, keepdim=True) & near.all(dim=-1, keepdim=True)
+        far = level == HOMING  # drive home already: outside the set, where nothing is promised
+        kept = (robots | far).all(dim=-1, keepdim=True) & (near | far[:, pairs].all(dim=-1)).all(dim=-1, keepdim=True)
         level = torch.where(kept, level, HOMING)
         return _by_level(action, home, level), level, rounds + 1
     reach = geometry.clearance + geometry.eps_distance + 2 * max_speed * geometry.dt

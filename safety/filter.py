@@ -71,8 +71,7 @@ class SafetyFilter(TensorDictModuleBase):
     The position's type and device are the filter's; other inputs are converted to its type.
 
     Raises:
-        ValueError: if a gain does not fit the world's time step, or the world's certificate, or if ``fixed_sizes`` meets
-            another solver than the exact one.
+        ValueError: if a gain does not fit the world's time step or certificate, or ``fixed_sizes`` the solver.
         KeyError: from ``forward``, if an input key is missing.
     """
 
@@ -109,6 +108,7 @@ class SafetyFilter(TensorDictModuleBase):
                 f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}."
             )
         nominal, position, energy, slot = inputs
+        self._layout(position)  # made before anything is traced
         outputs = self._filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)

@@ -1,13 +1,16 @@
 """fixed_sizes=true: the same actions where the programs decide, driving home where the shield does, and the same promise."""
 
 import copy
+import json
 
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import evaluate
 import safety.certificate
 import safety.filter
+import train
 from conf.naming import config_hash
 from conf.schema import to_config
 from envs import SurveillanceConfig, SurveillanceEnv, keys
@@ -18,6 +21,7 @@ from safety.certificate import HOLD, HOMING
 from safety.qp import project_halfspaces_ball
 from tests.test_config import composed
 from tests.test_qp import problems
+from tests.test_synchronisation import Waits
 from tests.worlds import COUNT, Adversary, draw_worlds, edge_states, parts, raw_margins, roll_out
 
 WORLDS, _ = draw_worlds(COUNT)
@@ -80,7 +84,7 @@ def test_same_actions_where_the_programs_decide_and_home_where_the_shield_does()
 @pytest.mark.parametrize("fields", KINDS_OF_FILTER, ids=str)
 def test_other_filters_and_calm_robots(fields):
     for index in SMALL[:4]:
-        env, inputs = edge(index)
+        _, inputs = edge(index)
         calm = (inputs[0] * 1e-3, *inputs[1:])
         for read in (inputs, calm):
             chosen, fixed = (filtered(index, read, fixed_sizes=f, **fields) for f in (False, True))
@@ -89,7 +93,6 @@ def test_other_filters_and_calm_robots(fields):
                 fixed[keys.ACTION][decided], chosen[keys.ACTION][decided], rtol=0, atol=1e-5, equal_nan=True
             )
             assert decided.double().mean() > 0.3
-        assert env.n_blocks == 1
 
 
 def test_a_nominal_action_that_is_admissible_passes_bit_for_bit():
@@ -259,20 +262,36 @@ def test_episodes_end_when_they_do_although_nobody_asks_before(fixed_sizes):
     assert outs[0][..., 0].sum() > 15
 
 
-def test_the_device_is_asked_once_an_episode(monkeypatch):
-    asked, any_done = [], torch.Tensor.any
-    env = SurveillanceEnv(SurveillanceConfig(horizon=10, on_violation="continue", resolution=3), 4)
-    td = env.reset()
-    monkeypatch.setattr(
-        SurveillanceEnv.__bases__[0], "any_done", lambda self, td: asked.append(1) or any_done(td["done"])
-    )
-    for _ in range(9):
+def test_the_device_is_asked_once_an_episode():
+    world = SurveillanceConfig(horizon=10, on_violation="continue", resolution=3)
+    env = SurveillanceEnv(world, 4, fixed_sizes=True)
+    td, counts = env.reset(), []
+    for _ in range(20):
         td[keys.ACTION] = torch.zeros(4, 3, 2)
-        _, td = env.step_and_maybe_reset(td)
-    assert not asked
-    td[keys.ACTION] = torch.zeros(4, 3, 2)
-    env.step_and_maybe_reset(td)
-    assert asked == [1]
+        with Waits() as waits:
+            _, td = env.step_and_maybe_reset(td)
+        counts.append(sum(waits.found.values()) > 0)
+    assert counts == [k in (0, 9, 10, 19) for k in range(20)]  # the first step and the last of an episode
+
+
+def test_a_robot_outside_the_set_does_not_send_its_healthy_neighbours_home():
+    world = SurveillanceConfig(on_violation="continue", horizon=0)
+    shares = []
+    for fixed_sizes in (False, True):
+        env = SurveillanceEnv(world, 16, seed=1, fixed_sizes=fixed_sizes)
+        f = SafetyFilter(SafetyConfig(), world, fixed_sizes=fixed_sizes)
+        energy = env.state["energy"].clone()
+        energy[:, 0] = 0.5 * world.energy_min
+        td = env.set_state(env.state["position"], energy.unsqueeze(-1))
+        generator, levels = torch.Generator().manual_seed(0), []
+        for _ in range(40):
+            noise = torch.randn(td[keys.POSITION].shape, generator=generator)
+            td = env.step(f(td.set(keys.NOMINAL_ACTION, world.max_speed * noise)))
+            levels.append(td[keys.LEVEL])
+            td = td["next"]
+        shares.append((torch.stack(levels)[..., 1:] == 0).double().mean())
+        assert (torch.stack(levels)[..., 0] == HOMING).double().mean() > 0.8  # until it has charged
+    assert min(shares) > 0.95
 
 
 # ---- the switch -------------------------------------------------------------------------------------------------------
@@ -284,6 +303,27 @@ def test_solvers_that_iterate_are_refused(fields):
     with pytest.raises(ValueError, match="fixed_sizes=true needs"):
         to_config(composed("fixed_sizes=true", *overrides))
     to_config(composed(*overrides))
+
+
+def test_an_evaluation_that_cannot_be_is_refused_before_it_writes(program, tmp_path):
+    small = ("num_envs=2", "steps=3", "pictures=false", "device=cpu")
+    code, output = program(evaluate.main, "controller=gather", "fixed_sizes=true", "safety.solver=qpth", *small)
+    assert code == 1
+    assert output.startswith("error: fixed_sizes=true needs the exact solver")
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_evaluations_of_a_run_at_fixed_sizes_have_a_folder_of_their_own(program, tmp_path):
+    small = ("collector.num_envs=4", "collector.total_frames=40", "train.warmup_frames=4", "buffer.batch_size=4")
+    quick = ("eval.num_envs=2", "eval.steps=2", "log.figures=false", "log.gif=false", "device=cpu", "agent.n_steps=1")
+    assert program(train.main, *small, *quick, "fixed_sizes=true")[0] == 0
+    (summary,) = tmp_path.glob("runs/*/*/summary.json")
+    asked = (f"run={summary.parent}", "num_envs=2", "steps=3", "pictures=false", "device=cpu", "resume=auto")
+    for more in ((), ("fixed_sizes=true",), ("safety.solver=qpth",)):
+        code, output = program(evaluate.main, *asked, *more)
+        assert code == 0, output
+    found = [json.loads(path.read_text())["fixed_sizes"] for path in summary.parent.glob("eval/*/eval.json")]
+    assert sorted(found) == [False, False, True]
 
 
 def test_runs_keep_their_names():
