@@ -38,6 +38,14 @@ def test_program(load, capsys, name, arguments, titles):
     assert all(any(character.isdigit() for character in "".join(row[3:])) for row in rows if row[0].strip().isdigit())
 
 
+def test_steps_on_a_gpu(load, capsys):
+    tiny = ["--batches", "3", "--compiled", "3", "--repeats", "1", "--device", "cpu"]
+    with torch.compiler.set_stance("force_eager"):
+        load("bench_gpu").main(tiny)
+    out = capsys.readouterr().out
+    assert [out.count(f" {kind} |") for kind in ("selecting", "fixed sizes", "fixed sizes, compiled")] == [1, 1, 1]
+
+
 def test_solvers_answer_the_same_problems(load):
     """Solutions and gradients agree with the exact solver's, so the times are of the same work.
 
