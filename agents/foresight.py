@@ -107,10 +107,8 @@ def cost_of_own(own: Tensor, others: Tensor, points: Tensor, weights: Tensor) ->
         if own.shape[-2] > 1:
             rest = take(squared_distances(others, points), other_indices(own.shape[-2], own.device), -2).amin(dim=-2)
             # the comparison as 0 or 1: a product with a bool takes four times as long
-            nearest, mine = (
-                torch.minimum(squared, rest),
-                weights * torch.lt(squared, rest, out=torch.empty_like(squared)),
-            )
+            mine = weights * torch.lt(squared, rest, out=torch.empty_like(squared))
+            nearest = torch.minimum(squared, rest)
         value = (nearest * weights).sum(-1)
         slope = 2 * (own * mine.sum(-1, keepdim=True) - mine @ points)
     return value + ((own - own.detach()) * slope).sum(-1)

@@ -205,8 +205,8 @@ class Config:
     resume: str = "auto"
     """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
     the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
-    of that run's folder; only collector.total_frames, train, eval, compile and
-    fixed_sizes may differ from its settings."""
+    of that run's folder; only collector.total_frames, train, eval, compile and fixed_sizes may differ from its
+    settings."""
     deterministic: bool = False
     """Refuse operations of PyTorch that may differ between runs of the same seed (CUDA has some; slower there)."""
     compile: bool = False

@@ -15,8 +15,5 @@ def places(mask: Tensor, *, fixed_sizes: bool) -> tuple[Tensor, ...]:
     """
     if not fixed_sizes:
         return mask.nonzero(as_tuple=True)
-    return tuple(x.flatten() for x in torch.meshgrid(*_ranges(mask), indexing="ij"))
-
-
-def _ranges(mask: Tensor) -> list[Tensor]:
-    return [torch.arange(size, device=mask.device) for size in mask.shape]
+    ranges = [torch.arange(size, device=mask.device) for size in mask.shape]
+    return tuple(x.flatten() for x in torch.meshgrid(*ranges, indexing="ij"))

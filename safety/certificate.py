@@ -140,11 +140,9 @@ def anchors(
         tight = (left < 0).any(dim=0) & ~(moving[world, i] & moving[world, j])
         if not fixed_sizes and not bool(tight.any()):
             break
-        both = (torch.cat([world, world]), torch.cat([i, j]))
-        pulled = torch.zeros_like(moving, dtype=slack.dtype).index_put(
-            both, tight.to(slack.dtype).repeat(2), accumulate=True
-        )
-        moving = moving | (pulled > 0)
+        robots = (torch.cat([world, world]), torch.cat([i, j]))  # of all pairs, several times each
+        pulls = tight.to(slack.dtype).repeat(2)
+        moving = moving | (torch.zeros_like(chord_bound).index_put(robots, pulls, accumulate=True) > 0)
     return chosen, left
 
 

@@ -174,10 +174,15 @@ def _solve(
     return QPSolution(*(x.reshape(batch + x.shape[1:]) for x in outputs))
 
 
+def _usable(p: Tensor, G: Tensor, h: Tensor) -> Tensor:
+    """Samples (B,) with finite p and G, and bounds that are numbers or +inf."""
+    return p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
+
+
 def _solve_fixed(p: Tensor, G: Tensor, h: Tensor, radius: float) -> Raw:
     """:func:`_solve_flat` of a projection at fixed sizes; samples with non-finite input take part as harmless ones."""
     tol, (p, G, h) = KKT_TOL[p.dtype], (p.double(), G.double(), h.double())
-    good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
+    good = _usable(p, G, h)
     p, G, h = (
         torch.where(good[:, None], p, 0.0),
         torch.where(good[:, None, None], G, 0.0),
@@ -200,7 +205,7 @@ def _solve_flat(Q: Tensor | None, p: Tensor, G: Tensor, h: Tensor, radius: float
     # A sum is finite only if all its terms are, and ten times cheaper than asking each.
     sums = [x.sum().isfinite() for x in (Q, p, G) if x is not None]
     if not bool(torch.stack([*sums, (h > -torch.inf).all()]).all()):
-        good = p.isfinite().all(-1) & G.isfinite().all(-1).all(-1) & (h > -torch.inf).all(-1)
+        good = _usable(p, G, h)
         if Q is not None:
             good = good & Q.isfinite().all(-1).all(-1)
         index = good.nonzero()[:, 0]

@@ -110,8 +110,14 @@ def moved(thing):
     return thing
 
 
-def world_of(name, **fields):
-    return SurveillanceConfig(**{"resolution": 5, "on_violation": "continue", "horizon": 50} | WORLDS[name] | fields)
+def world_of(name):
+    return SurveillanceConfig(**{"resolution": 5, "on_violation": "continue", "horizon": 50} | WORLDS[name])
+
+
+def filter_inputs():
+    """Nominal actions, positions, energies and slots of six worlds."""
+    vectors = (torch.empty(6, 3, 2, device=META) for _ in range(2))
+    return *vectors, torch.empty(6, 3, device=META), torch.zeros(6, 3, dtype=torch.int64, device=META)
 
 
 def on_the_stand_in(tensordict):
@@ -185,13 +191,8 @@ def test_updates_of_several_learners(agent):
 def test_filters(safety):
     world = world_of("default")
     f = SafetyFilter(SafetyConfig(**safety), world, fixed_sizes=True)
-    state = (
-        torch.empty(6, 3, 2, device=META),
-        torch.empty(6, 3, device=META),
-        torch.zeros(6, 3, dtype=torch.int64, device=META),
-    )
     with torch.no_grad():
-        assert all(out.device == META for out in f.filter(torch.empty(6, 3, 2, device=META), *state))
+        assert all(out.device == META for out in f.filter(*filter_inputs()))
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -244,13 +245,8 @@ def test_the_stand_in_would_tell():
     with pytest.raises(AssertionError):
         torch.rand(3, generator=AskedGenerator(), device=META)
     selecting = SafetyFilter(SafetyConfig(), world_of("default"))
-    state = (
-        torch.empty(6, 3, 2, device=META),
-        torch.empty(6, 3, device=META),
-        torch.zeros(6, 3, dtype=torch.int64, device=META),
-    )
     with torch.no_grad(), pytest.raises((RuntimeError, NotImplementedError)):
-        selecting.filter(torch.empty(6, 3, 2, device=META), *state)
+        selecting.filter(*filter_inputs())
 
 
 def test_a_state_of_another_kind_of_device_seeds_the_generator():
