@@ -8,9 +8,8 @@ import functools
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from envs import keys
@@ -20,12 +19,16 @@ from envs.config import SurveillanceConfig
 from envs.coverage import squared_distances, voronoi_moments, weighted_sum
 from envs.density import Density
 from envs.dynamics import components_first, limit_speed
+from envs.graphs import check_graphs, graphed
 from envs.metrics import violations
 from envs.observation import observation_fields, observe
 from envs.reassignment import reassign_slots
+from envs.specs import make_specs
 from envs.starts import draw_starts
 from envs.transition import transition
 
+STATE = ("position", "energy", "slot", "step", "density")
+"""A world's state, by name."""
 CHUNK_DISTANCES = 2**20
 """Squared distances of robots and quadrature points that a step holds at a time."""
 
@@ -44,9 +47,11 @@ class SurveillanceEnv(EnvBase):
         compile_functions: run transition and violation counting through torch.compile; same results to rounding.
         fixed_sizes: let no size in a step depend on the data (:mod:`envs.selection`), so that the host of a GPU waits only
             where a world may be done: never within an episode with ``on_violation=continue``. The same results, slower on a CPU.
+            With ``compile_functions`` the whole step is one compiled function.
+        cuda_graphs: record a step's kernels once and replay them (:mod:`envs.graphs`); needs ``fixed_sizes``.
 
     Raises:
-        ValueError: if ``num_envs < 1``, or no multiple of the number of seeds.
+        ValueError: if ``num_envs < 1``, or no multiple of the number of seeds; if ``cuda_graphs`` without ``fixed_sizes``.
     """
 
     def __init__(
@@ -58,7 +63,9 @@ class SurveillanceEnv(EnvBase):
         *,
         compile_functions: bool = False,  # TorchRL takes the word compile for itself: all of a step, TensorDicts too
         fixed_sizes: bool = False,
+        cuda_graphs: bool = False,
     ) -> None:
+        check_graphs(cuda_graphs=cuda_graphs, fixed_sizes=fixed_sizes)
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs} is out of range: at least one world is needed.")
         seeds = list(seed) if isinstance(seed, Sequence) else [seed]
@@ -75,12 +82,17 @@ class SurveillanceEnv(EnvBase):
         self.stations = torch.tensor(config.station_positions, **factory)
         self.slots = torch.tensor(config.slot_positions, **factory)
         self.bounds = torch.tensor(config.bounds, **factory)
-        self._transition = compiled(functools.partial(transition, config=config), enabled=compile_functions)
-        self._violations = compiled(functools.partial(violations, config=config), enabled=compile_functions)
+        parts = compile_functions and not fixed_sizes
+        self._transition = compiled(functools.partial(transition, config=config), enabled=parts)
+        self._violations = compiled(functools.partial(violations, config=config), enabled=parts)
+        whole = compiled(self.advance, enabled=compile_functions and fixed_sizes, dynamic=False)
+        self._advance = graphed(whole, enabled=cuda_graphs)
         self.reference_cost = self.density.reference_cost()
         self.n_blocks = len(seeds)
         self.blocks = [WorldBlock(self, k, torch.Generator(device=device)) for k in range(len(seeds))]
-        self._make_specs()
+        self.n_observation = list(observation_fields(config, self.density).values())[-1].stop
+        specs = make_specs(config, num_envs, self.n_observation, self.density.n_params, len(self.slots), device)
+        self.observation_spec, self.action_spec, self.reward_spec, self.done_spec = specs
         for block, own in zip(self.blocks, seeds, strict=True):
             if own is not None:
                 block.generator.manual_seed(own)
@@ -114,49 +126,25 @@ class SurveillanceEnv(EnvBase):
             self._continues = False
         self.sure_steps = 0.0
         self._write_start(mask.reshape(self.batch_size))
-        out = self._outputs(*self._watch(self.state["position"], self.state["density"], advance=False))
-        for kind in keys.VIOLATION_KINDS:
-            out[(*keys.VIOLATION, kind)] = torch.zeros((*self._robots, 1), dtype=torch.bool, device=self.device)
-        return self._with_flags(out, torch.zeros_like(mask).reshape(-1, 1), torch.zeros_like(mask).reshape(-1, 1))
+        state = self.state
+        _, cost, centroid = self._watch(state["position"], state["density"], advance=False)
+        observation = self._observe(*(state[name] for name in STATE), centroid)
+        nobody = torch.zeros((*self._robots, len(keys.VIOLATION_KINDS)), dtype=torch.bool, device=self.device)
+        never = torch.zeros_like(mask).reshape(-1, 1)
+        return self._outputs(observation, cost, nobody, never, never)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        config, state = self.config, self.state
-        position, energy = components_first(state["position"]), state["energy"]
-        velocity = limit_speed(components_first(tensordict[keys.ACTION].to(position.dtype)), config.max_speed)
-        if config.on_violation == "continue":
-            velocity = torch.where((energy < config.energy_min).unsqueeze(-1), 0.0, velocity)
         current = tensordict.get(keys.CHARGE_CURRENT, None)
-        current = torch.ones_like(energy) if current is None else current.squeeze(-1).to(energy.dtype)
-        next_position, next_energy = self.transition(position, energy, velocity, current)
-
-        flags = self._violations(position, next_position, next_energy, self.slots)
-        violated = torch.stack(list(flags.values())).any(dim=0).any(dim=-1, keepdim=True)
-        watched = self._watch(next_position, state["density"], advance=True)
-        slot = state["slot"]
-        if config.reassign_slots:
-            limits = (self.slots, self.geometry, self.bounds)
-            slot = reassign_slots(next_position, next_energy, slot, *limits, fixed_sizes=self.fixed_sizes)
-        self.sure_steps -= 1
-        self.state = TensorDict(
-            {
-                "position": next_position,
-                "energy": next_energy,
-                "slot": slot,
-                "step": state["step"] + 1,
-                "density": watched[0],
-            },
-            self.batch_size,
-            device=self.device,
+        current = torch.ones_like(self.state["energy"]) if current is None else current.squeeze(-1)
+        state = [self.state[name] for name in STATE]
+        *state, observation, cost, violated, reward, terminated, truncated = self._advance(
+            *state, tensordict[keys.ACTION], current
         )
-        out = self._outputs(*watched)
-        for kind, flag in flags.items():
-            out[(*keys.VIOLATION, kind)] = flag.unsqueeze(-1)
-        reward = -out[keys.COVERAGE_COST] / self.reference_cost
-        out[keys.REWARD] = reward.unsqueeze(-1).expand(*self._robots, 1).clone()
-        terminated = violated if config.on_violation == "terminate" else torch.zeros_like(violated)
-        step = self.state["step"]
-        truncated = step >= config.horizon if config.horizon else torch.zeros_like(violated)
-        return self._with_flags(out, terminated, truncated)
+        self.sure_steps -= 1
+        self.state = TensorDict(dict(zip(STATE, state, strict=True)), self.batch_size, device=self.device)
+        out = self._outputs(observation, cost, violated, terminated, truncated)
+        out[keys.REWARD] = reward
+        return out
 
     def state_dict(self, *args, **kwargs) -> dict:
         """State of all worlds and of the random generator: restoring it continues the same random stream."""
@@ -202,6 +190,51 @@ class SurveillanceEnv(EnvBase):
         return self._reset(TensorDict({"_reset": nobody}, self.batch_size))
 
     # ---- physics ---------------------------------------------------------------------------------------------------
+    def advance(
+        self,
+        position: Tensor,
+        energy: Tensor,
+        slot: Tensor,
+        step: Tensor,
+        density: Tensor,
+        action: Tensor,
+        current: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """A step on plain tensors: a function of its arguments alone.
+
+        Args:
+            position: ``(B, N, d)``, m.
+            energy: ``(B, N)``.
+            slot: ``(B, N)`` int64.
+            step: ``(B, 1)`` int64, since the episodes began.
+            density: ``(B, n_params)``.
+            action: ``(B, N, d)``, m/s.
+            current: ``(B, N)``, accepted charging current in [0, 1].
+
+        Returns:
+            The next of the first five, then observation ``(B, N, n_obs)``, coverage cost ``(B, 1)``, violations ``(B, N, 4)``,
+            reward ``(B, N, 1)``, terminated and truncated ``(B, 1)``.
+        """
+        config, position = self.config, components_first(position)
+        velocity = limit_speed(components_first(action.to(position.dtype)), config.max_speed)
+        if config.on_violation == "continue":
+            velocity = torch.where((energy < config.energy_min).unsqueeze(-1), 0.0, velocity)
+        next_position, next_energy = self.transition(position, energy, velocity, current.to(energy.dtype))
+        flags = self._violations(position, next_position, next_energy, self.slots)
+        violated = torch.stack(list(flags.values()), dim=-1)
+        density, cost, centroid = self._watch(next_position, density, advance=True)
+        if config.reassign_slots:
+            limits = (self.slots, self.geometry, self.bounds)
+            slot = reassign_slots(next_position, next_energy, slot, *limits, fixed_sizes=self.fixed_sizes)
+        state = (next_position, next_energy, slot, step + 1, density)
+        reward = -cost / self.reference_cost
+        reward = reward.unsqueeze(-1).expand(*position.shape[:-1], 1).clone()
+        terminated = violated.flatten(1).any(dim=-1, keepdim=True)
+        if config.on_violation == "continue":
+            terminated = torch.zeros_like(terminated)
+        truncated = state[3] >= config.horizon if config.horizon else torch.zeros_like(terminated)
+        return *state, self._observe(*state, centroid), cost, violated, reward, terminated, truncated
+
     def transition(self, position: Tensor, energy: Tensor, velocity: Tensor, current: Tensor) -> tuple[Tensor, Tensor]:
         """Raw next position and energy: never saturated by walls or battery.
 
@@ -279,11 +312,13 @@ class SurveillanceEnv(EnvBase):
         params, cost, centroid = parts[0] if len(parts) == 1 else (torch.cat(x) for x in zip(*parts, strict=True))
         return params, cost, centroid if self.config.observe_centroid else None
 
-    def _outputs(self, params: Tensor, cost: Tensor, centroid: Tensor | None) -> TensorDict:
-        """All keys that describe the present state, given what :meth:`_watch` returned of it."""
+    def _outputs(
+        self, observation: Tensor, cost: Tensor, violated: Tensor, terminated: Tensor, truncated: Tensor
+    ) -> TensorDict:
+        """All keys that describe the present state, ``violated`` ``(B, N, 4)`` by kind."""
         state = self.state
-        out = {
-            keys.OBSERVATION: self._observe(params, centroid),
+        out: dict[NestedKey, Tensor] = {
+            keys.OBSERVATION: observation,
             keys.POSITION: state["position"].clone(),
             keys.ENERGY: state["energy"].unsqueeze(-1).clone(),
             keys.SLOT: state["slot"].unsqueeze(-1).clone(),
@@ -291,63 +326,18 @@ class SurveillanceEnv(EnvBase):
             keys.STEP_COUNT: state["step"].clone(),
         }
         if self.density.n_params:
-            out[keys.DENSITY] = params.clone()
-        return TensorDict(out, self.batch_size, device=self.device)
-
-    def _observe(self, params: Tensor, centroid: Tensor | None) -> Tensor:
-        state = self.state
-        seen, middle = self.density.observe(params), self.bounds.mean(-1)
-        own = (state["position"], state["energy"], self.slots[state["slot"]], state["step"])
-        return observe(*own, centroid, seen, self.stations, middle, self.config)
-
-    def _with_flags(self, out: TensorDict, terminated: Tensor, truncated: Tensor) -> TensorDict:
+            out[keys.DENSITY] = state["density"].clone()
+        for kind, flag in zip(keys.VIOLATION_KINDS, violated.split(1, dim=-1), strict=True):
+            out[(*keys.VIOLATION, kind)] = flag
         flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         for name, flag in flags.items():
             out[name] = flag
             out[(keys.AGENTS, name)] = flag.unsqueeze(-1).expand(*self._robots, 1).clone()
-        return out
+        return TensorDict(out, self.batch_size, device=self.device)
 
-    def _make_specs(self) -> None:
-        c, (b, n) = self.config, self._robots
-        factory = {"dtype": c.torch_dtype, "device": self.device}
-
-        def unbounded(*shape: int) -> Unbounded:
-            return Unbounded(shape=(*self.batch_size, *shape), **factory)
-
-        def flag(*shape: int) -> Binary:
-            return Binary(n=1, shape=(*self.batch_size, *shape), dtype=torch.bool, device=self.device)
-
-        self.n_observation = list(observation_fields(c, self.density).values())[-1].stop
-
-        def agents(**entries) -> Composite:
-            return Composite(entries, shape=(b,), device=self.device)
-
-        self.observation_spec = Composite(
-            {
-                keys.AGENTS: agents(
-                    observation=unbounded(n, self.n_observation),
-                    position=unbounded(n, c.dimension),
-                    energy=unbounded(n, 1),
-                    slot=Categorical(n=len(self.slots), shape=(b, n, 1), dtype=torch.int64, device=self.device),
-                    violation=agents(**{kind: flag(n, 1) for kind in keys.VIOLATION_KINDS}),
-                ),
-                keys.COVERAGE_COST: unbounded(1),
-                keys.STEP_COUNT: Unbounded(shape=(b, 1), dtype=torch.int64, device=self.device),
-            },
-            shape=self.batch_size,
-            device=self.device,
-        )
-        if self.density.n_params:
-            self.observation_spec[keys.DENSITY] = unbounded(self.density.n_params)
-        # A box around the speed ball: the environment's actuators cut what lies outside the ball.
-        self.action_spec = Composite(
-            {keys.AGENTS: agents(action=Bounded(-c.max_speed, c.max_speed, shape=(b, n, c.dimension), **factory))},
-            shape=self.batch_size,
-            device=self.device,
-        )
-        self.reward_spec = Composite(
-            {keys.AGENTS: agents(reward=unbounded(n, 1))}, shape=self.batch_size, device=self.device
-        )
-        done = {name: flag(1) for name in ("done", "terminated", "truncated")}
-        done[keys.AGENTS] = agents(**{name: flag(n, 1) for name in ("done", "terminated", "truncated")})
-        self.done_spec = Composite(done, shape=self.batch_size, device=self.device)
+    def _observe(
+        self, position: Tensor, energy: Tensor, slot: Tensor, step: Tensor, density: Tensor, centroid: Tensor | None
+    ) -> Tensor:
+        seen, middle = self.density.observe(density), self.bounds.mean(-1)
+        own = (position, energy, self.slots[slot], step)
+        return observe(*own, centroid, seen, self.stations, middle, self.config)

@@ -1,0 +1,119 @@
+"""Optional CUDA graphs of functions of tensors: the kernels of a call are recorded once and launched together from then on.
+
+A small batch leaves a GPU idle while the host launches one kernel after the other; a graph takes that time away. What is
+recorded is the kernels with the addresses they read and write, so nothing in the function may depend on the data but the
+numbers themselves (:mod:`envs.selection`), and what it reads besides its arguments must stay where it is.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+WARM_UP = 3
+"""Calls before the recording: they make what is made once (layouts, optimiser states, compiled code)."""
+
+Outputs = tuple[Tensor, ...] | dict[str, Tensor]
+
+
+class Recording(Protocol):
+    """A function's operations on tensors that stay where they are."""
+
+    outputs: Outputs
+    """What the function returned, rewritten by every replay."""
+
+    def replay(self) -> None:
+        """Do them once, on what the inputs now hold."""
+        ...
+
+
+class CudaRecording:
+    """A CUDA graph.
+
+    Args:
+        function: what is recorded, without being carried out.
+        inputs: its arguments.
+    """
+
+    def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor]) -> None:
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.device(inputs[0].device), torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+            self.outputs = function(*inputs)
+
+    def replay(self) -> None:
+        """Launch it."""
+        self.graph.replay()
+
+
+RECORDINGS: dict[str, Callable[[Callable[..., Outputs], Sequence[Tensor]], Recording]] = {"cuda": CudaRecording}
+"""By type of device; on others functions are called as they are."""
+
+
+class Graphed:
+    """A function of tensors, recorded at the fourth call with arguments of the same shapes and replayed from then on.
+
+    The same kernels on the same numbers: the function's own results, bit for bit. It may write into tensors that it holds
+    (networks, moments), but must neither draw random numbers nor ask for a tensor's value. Calls whose arguments need
+    gradients are never recorded.
+
+    Args:
+        function: tensors in, as positional arguments; a tuple of tensors out, or a dictionary of them.
+    """
+
+    def __init__(self, function: Callable[..., Outputs]) -> None:
+        self.function = function
+        self.calls: Counter[tuple] = Counter()
+        self.recordings: dict[tuple, tuple[list[Tensor], Recording]] = {}
+
+    def __reduce__(self) -> tuple[Callable, tuple]:
+        """Copies and pickles record anew."""
+        return Graphed, (self.function,)
+
+    def __call__(self, *tensors: Tensor) -> Any:
+        """The function's result, in tensors of its own."""
+        record = RECORDINGS.get(tensors[0].device.type)
+        if record is None or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+            return self.function(*tensors)
+        key = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
+        if key not in self.recordings:
+            self.calls[key] += 1
+            if self.calls[key] <= WARM_UP:
+                return _beside(self.function, tensors)
+            inputs = [tensor.clone() for tensor in tensors]
+            self.recordings[key] = (inputs, record(self.function, inputs))
+        inputs, recording = self.recordings[key]
+        for own, given in zip(inputs, tensors, strict=True):
+            own.copy_(given)
+        recording.replay()
+        outputs = recording.outputs
+        if isinstance(outputs, dict):
+            return {name: value.clone() for name, value in outputs.items()}
+        return tuple(value.clone() for value in outputs)
+
+
+def _beside(function: Callable[..., Outputs], tensors: Sequence[Tensor]) -> Outputs:
+    """The result, on a GPU by way of another stream: gradients' bookkeeping then does not hold on to the usual one."""
+    if not tensors[0].is_cuda:
+        return function(*tensors)
+    usual, other = torch.cuda.current_stream(tensors[0].device), torch.cuda.Stream(tensors[0].device)
+    other.wait_stream(usual)
+    with torch.cuda.stream(other):
+        outputs = function(*tensors)
+    usual.wait_stream(other)
+    return outputs
+
+
+def graphed(function: Callable[..., Any], *, enabled: bool) -> Callable[..., Any]:
+    """``function``, or its :class:`Graphed` form if ``enabled``."""
+    return Graphed(function) if enabled else function
+
+
+def check_graphs(*, cuda_graphs: bool, fixed_sizes: bool) -> None:
+    """Raise a ``ValueError`` if graphs are asked for where sizes depend on the data."""
+    if cuda_graphs and not fixed_sizes:
+        raise ValueError(
+            "cuda_graphs=true cannot record operations whose sizes depend on the data, as with fixed_sizes=false: set "
+            "fixed_sizes=true too."
+        )
