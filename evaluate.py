@@ -54,8 +54,8 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    computing = {"compile_functions": config.compile, "fixed_sizes": config.fixed_sizes}
-    env = SurveillanceEnv(world, config.num_envs, device, seed=env_seed, **computing)
+    sizes = {"fixed_sizes": config.fixed_sizes, "cuda_graphs": config.cuda_graphs}
+    env = SurveillanceEnv(*(world, config.num_envs, device), seed=env_seed, compile_functions=config.compile, **sizes)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)
@@ -64,7 +64,7 @@ def main(cfg: DictConfig) -> None:
     else:
         name = config.controller or ""
         nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
-    safety_filter = SafetyFilter(safety, world, compile=config.compile, fixed_sizes=config.fixed_sizes)
+    safety_filter = SafetyFilter(safety, world, compile=config.compile, **sizes)
     policy = TensorDictSequential(nominal, safety_filter)
     steps = config.steps or rollout_steps(world.horizon)
     asked = {
@@ -92,7 +92,7 @@ def main(cfg: DictConfig) -> None:
         "wall_time_s": time.perf_counter() - start,
         **asked,
         "adversary": config.adversary,
-        "fixed_sizes": config.fixed_sizes,
+        **sizes,
         "git_hash": git_hash(),
         "env": asdict(world),
         "safety": asdict(safety),

@@ -18,9 +18,9 @@ from tqdm import tqdm
 
 from agents.collection import make_collection, seeds_of_streams
 from agents.interruption import StopSignals
-from agents.learners import make_learners
-from agents.maddpg import update_step
-from agents.networks import make_policies, noises_of
+from agents.learners import make_learners, make_update
+from agents.networks import acting, make_policies
+from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds
 from agents.run import (
@@ -79,7 +79,11 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     world, safety, seeds = config.env, config.safety, list(folders)
     noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
     eval_env = SurveillanceEnv(world, config.eval.num_envs, device, **config.computing)
-    learners, learner = make_learners(eval_env.n_observation, world, config.agent, safety, device, seeds=seeds)
+    graphs = {"cuda_graphs": config.cuda_graphs}
+    learners, learner = make_learners(
+        eval_env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
+    )
+    update = make_update(learner, config.agent, safety, **graphs)
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, **config.computing)
     (_, safety_filter), explore_policy = policies
     noises = noises_of(explore_policy)
@@ -96,7 +100,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             worlds=collection.blocks[k],
             waiting=multi_step.blocks[k],
             noise=noises[k],
-            policy=TensorDictSequential(learners[k].actor, safety_filter),
+            policy=TensorDictSequential(acting(learners[k].actor, **graphs), safety_filter),
             eval_env=eval_env,
             seconds=seconds,
         )
@@ -129,7 +133,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             seconds.spent("collect")
             if any(run.learns for run in runs):
                 for minibatch in minibatches(runs, config.train.n_updates):
-                    losses = update_step(minibatch, *learner.updates, config.agent)
+                    losses = update(minibatch)
             seconds.spent("update")
             for_each(runs, TrainingRun.log, [losses] * n_runs, [seconds] * n_runs, range(n_runs))
             bar.set_postfix_str(runs[0].progress, refresh=False)

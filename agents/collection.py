@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from agents.learners import Learner
-from agents.networks import ExplorationNoise
+from agents.noise import ExplorationNoise
 from agents.pipeline import collect
 from agents.training_config import Config
 from agents.worker_pools import Pool, ProcessPool, RayPool, WorkerLostError

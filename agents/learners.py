@@ -7,18 +7,20 @@ of single ones: so with the default's layers and robots; not with one robot, in 
 it is to rounding.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from agents.config import AgentConfig
-from agents.maddpg import MADDPGLoss, make_loss, make_optimizers
+from agents.maddpg import MADDPGLoss, make_loss, make_optimizers, update_step
 from agents.networks import make_actor, make_critic
 from envs import SurveillanceConfig
+from envs.graphs import Graphed
 from safety import SafetyConfig
 
 NETWORKS = (
@@ -59,14 +61,18 @@ def make_learner(
     *,
     seed: int | None = None,
     n_learners: int = 1,
+    cuda_graphs: bool = False,
 ) -> Learner:
-    """Build a learner; with ``seed`` the global random stream starts there, which draws the initial weights."""
+    """Build a learner; with ``seed`` the global random stream starts there, which draws the initial weights.
+
+    With ``cuda_graphs`` its update can be recorded (:func:`make_update`).
+    """
     if seed is not None:
         torch.manual_seed(seed)
     actor = make_actor(n_observation, world, agent, n_learners).to(device)
     critic = make_critic(n_observation, world, agent, n_learners).to(device)
     loss, target_updater = make_loss(actor, critic, agent, safety, world)
-    return Learner(actor, loss, make_optimizers(loss, agent), target_updater)
+    return Learner(actor, loss, make_optimizers(loss, agent, cuda_graphs=cuda_graphs), target_updater)
 
 
 class LearnerStack(Learner):
@@ -118,14 +124,43 @@ class LearnerStack(Learner):
         return stacked.unflatten(0, (len(self.parts), -1)).unbind()
 
 
-def make_learners(*args: object, seeds: Sequence[int]) -> tuple[list[Learner], Learner]:
+def make_learners(*args: object, seeds: Sequence[int], cuda_graphs: bool = False) -> tuple[list[Learner], Learner]:
     """A learner per seed, and what is updated: the only one, or their stack.
 
     Args:
         args: the positional arguments of :func:`make_learner`.
         seeds: one for each.
+        cuda_graphs: as there.
     """
-    parts = [make_learner(*args, seed=seed) for seed in seeds]  # pyright: ignore[reportArgumentType]
+    parts = [make_learner(*args, seed=seed, cuda_graphs=cuda_graphs) for seed in seeds]  # pyright: ignore[reportArgumentType]
     if len(parts) == 1:
         return parts, parts[0]
-    return parts, LearnerStack(parts, make_learner(*args, n_learners=len(parts)))  # pyright: ignore[reportArgumentType]
+    whole = make_learner(*args, n_learners=len(parts), cuda_graphs=cuda_graphs)  # pyright: ignore[reportArgumentType]
+    return parts, LearnerStack(parts, whole)
+
+
+def make_update(
+    learner: Learner, agent: AgentConfig, safety: SafetyConfig, *, cuda_graphs: bool = False
+) -> Callable[[TensorDictBase], dict[str, Tensor]]:
+    """:func:`agents.maddpg.update_step` of a learner, as a function of the minibatch.
+
+    Args:
+        learner: with ``cuda_graphs`` if asked for here.
+        agent: reduction and clipping.
+        safety: the filter; one inside the loss solves programs whose number depends on the data, and is not recorded.
+        cuda_graphs: record the update and replay it (:mod:`envs.graphs`).
+    """
+
+    def update(minibatch: TensorDictBase) -> dict[str, Tensor]:
+        return update_step(minibatch, *learner.updates, agent)
+
+    if not cuda_graphs or safety.in_loss:
+        return update
+    reads = learner.loss.reads
+
+    def update_on(*tensors: Tensor) -> dict[str, Tensor]:
+        observation = tensors[0]
+        return update(TensorDict(dict(zip(reads, tensors, strict=True)), observation.shape[:-2], observation.device))
+
+    recorded = Graphed(update_on)
+    return lambda minibatch: recorded(*(minibatch[key] for key in reads))

@@ -198,12 +198,32 @@ def make_loss(
     return loss, LayersUpdate(loss, tau=agent.tau)
 
 
-def make_optimizers(loss: MADDPGLoss, agent: AgentConfig) -> dict[str, torch.optim.Optimizer]:
-    """One Adam per loss key: ``{"loss_actor": .., "loss_value": ..}``."""
-    return {
-        "loss_actor": torch.optim.Adam(list(loss.actor_network_params.values(True, True)), lr=agent.actor_lr),
-        "loss_value": torch.optim.Adam(list(loss.value_network_params.values(True, True)), lr=agent.critic_lr),
+def make_optimizers(
+    loss: MADDPGLoss, agent: AgentConfig, *, cuda_graphs: bool = False
+) -> dict[str, torch.optim.Optimizer]:
+    """One Adam per loss key: ``{"loss_actor": .., "loss_value": ..}``; with ``cuda_graphs`` one that can be recorded."""
+    networks = {
+        "loss_actor": (loss.actor_network_params, agent.actor_lr),
+        "loss_value": (loss.value_network_params, agent.critic_lr),
     }
+    made: dict[str, torch.optim.Optimizer] = {}
+    for name, (parameters, lr) in networks.items():
+        weights = list(parameters.values(True, True))
+        # fused: all of a step in one kernel, which reads the count of steps where the weights are
+        recorded = {"fused": True, "capturable": weights[0].is_cuda} if cuda_graphs else {}
+        made[name] = torch.optim.Adam(weights, lr=lr, **recorded)
+        made[name].register_load_state_dict_pre_hook(_keep_own_way)
+    return made
+
+
+def _keep_own_way(optimizer: torch.optim.Optimizer, state_dict: dict) -> dict:
+    """The state of a checkpoint for an optimiser that computes in its own way, whatever the checkpoint's did."""
+    own = optimizer.param_groups[0]
+    groups = [group | {name: own[name] for name in ("fused", "capturable")} for group in state_dict["param_groups"]]
+    state = state_dict["state"]
+    if not own["fused"]:  # the count of steps is the host's
+        state = {key: moments | {"step": moments["step"].cpu()} for key, moments in state.items()}
+    return state_dict | {"param_groups": groups, "state": state}
 
 
 def reduce_robots(loss: Tensor, agent: AgentConfig) -> Tensor:

@@ -26,6 +26,8 @@ COLLECTOR_OPTIONS = {
     "track_traj_ids": False,
     "trust_policy": True,
     "auto_register_policy_transforms": False,  # the noise reads the world's own step count
+    "return_same_td": True,  # a batch is used before the next one is collected: no copy
+    "no_cuda_sync": True,  # one device, one stream
 }
 STEPS = "steps_to_next_obs"  # TorchRL's name for the length of an n-step transition
 
@@ -73,6 +75,8 @@ def collect(
     env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, frames: int, *, resumed: bool = False
 ) -> Generator[TensorDictBase, None, None]:
     """Batches ``(num_envs, T)`` of TorchRL's collector; warm-up uses the policy, never the environment's random action.
+
+    Each batch takes the place of the one before, in the same memory.
 
     Args:
         env: the worlds, closed at the end.

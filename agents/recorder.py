@@ -4,12 +4,21 @@ import math
 import time
 
 import torch
-from tensordict import TensorDictBase
-from torch import nn
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
 
+from agents.divergence import WATCHED
 from envs import SurveillanceConfig, keys
+from envs.graphs import Graphed
 from envs.metrics import EpisodeTracker
-from safety.statistics import FilterStatistics
+from safety.statistics import MARGINS, FilterStatistics
+
+COUNTED: list[NestedKey] = [
+    *(*WATCHED.values(), keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE, *MARGINS.values()),
+    *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),
+    *(("next", keys.COVERAGE_COST), ("next", "done")),
+]
+"""What :meth:`TrainingRecorder.update` reads of a batch."""
 
 
 class Every:
@@ -106,10 +115,12 @@ class TrainingRecorder:
         world: the world.
         num_envs: number of worlds.
         device: where the per-world sums live.
+        cuda_graphs: record the counting and replay it (:mod:`envs.graphs`).
     """
 
-    def __init__(self, world: SurveillanceConfig, num_envs: int, device) -> None:
+    def __init__(self, world: SurveillanceConfig, num_envs: int, device, *, cuda_graphs: bool = False) -> None:
         self.world = world
+        self._count = Graphed(self._count_tensors) if cuda_graphs else None
         self.frames = 0
         self.violations = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.episodes = EpisodeTracker(num_envs, device)
@@ -130,23 +141,48 @@ class TrainingRecorder:
         self.best_cost = cost
         return True
 
-    def update(self, batch: TensorDictBase) -> None:
-        """Take in a collected batch ``(num_envs, T)``."""
-        following = batch["next"]
-        flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
-        sums = torch.stack([*(flag.sum().double() for flag in flags), following[keys.COVERAGE_COST].sum().double()])
-        *counts, cost = sums.tolist()
-        for kind, count in zip(keys.VIOLATION_KINDS, counts, strict=True):
-            self.violations[kind] += int(count)
-            self._violations_recent[kind] += int(count)
-        violating = torch.stack(flags).any(dim=0).sum(-1)  # robot-steps: a robot may violate twice at once
-        self.episodes.update(following[keys.REWARD][..., 0, 0], violating, following["done"].squeeze(-1))
-        found = self.filter.measure(batch)
+    def update(self, batch: TensorDictBase) -> bool:
+        """Take in a collected batch ``(num_envs, T)``; waits for the device once (and where episodes end).
+
+        Returns:
+            Whether there is something in it that ought not to be: a violation, a state outside the filter's set, or a number
+            that may not be finite.
+        """
+        if self._count is None:
+            counted, violating = self._counts(batch)
+        else:
+            self._keys = [key for key in COUNTED if key in batch.keys(True)]
+            counted, violating = self._count(*(batch[key] for key in self._keys))
+        found = dict(zip(self._names, counted.tolist(), strict=True))
+        for kind in keys.VIOLATION_KINDS:
+            self.violations[kind] += int(found[kind])
+            self._violations_recent[kind] += int(found[kind])
+        reward, done = batch["next", *keys.REWARD][..., 0, 0], batch["next", "done"].squeeze(-1)
+        self.episodes.update(reward, violating, done, any_done=found["done"] > 0)
         self.filter.add(found)
         self._recent.add(found)
-        self._cost[0] += cost
+        self._cost[0] += found["cost"]
         self._cost[1] += batch.numel()
         self.frames += batch.numel()
+        return any(found[kind] > 0 for kind in (*keys.VIOLATION_KINDS, "outside")) or not found["finite"]
+
+    def _counts(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Sums over a batch, float64, in the order of ``_names``, and the violating robots of each step ``(num_envs, T)``."""
+        following = batch["next"]
+        flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
+        found = dict(zip(keys.VIOLATION_KINDS, (flag.sum().double() for flag in flags), strict=True))
+        found["cost"] = following[keys.COVERAGE_COST].sum().double()
+        found["done"] = following["done"].any().double()
+        # finite only if all terms are; an overflow is looked at more closely
+        found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
+        found |= self.filter.numbers(batch)
+        self._names = list(found)
+        return torch.stack(list(found.values())), torch.stack(flags).any(dim=0).sum(
+            -1
+        )  # a robot may violate twice at once
+
+    def _count_tensors(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        return self._counts(TensorDict(dict(zip(self._keys, tensors, strict=True)), tensors[0].shape[:2]))
 
     def scalars(self) -> dict[str, float]:
         """Numbers since the last call, by TensorBoard tag; starts a new interval."""

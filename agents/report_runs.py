@@ -32,6 +32,7 @@ UNNAMED = {
     "debug",
     "compile",
     "fixed_sizes",
+    "cuda_graphs",
     "checkpoint",
     "eval",
     "hydra",

@@ -19,7 +19,7 @@ from agents.divergence import DivergedError, check_batch, check_finite, check_we
 from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
-from agents.networks import ExplorationNoise
+from agents.noise import ExplorationNoise
 from agents.pipeline import WaitingSteps, draw, make_buffer
 from agents.recorder import Every, Seconds, TrainingRecorder
 from agents.training_config import Config
@@ -94,7 +94,7 @@ class TrainingRun:
         device, agent = eval_env.device, config.agent
         self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
         self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
-        self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
+        self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device, cuda_graphs=config.cuda_graphs)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),
             "evaluate": Every(config.eval.interval_frames),
@@ -160,9 +160,9 @@ class TrainingRun:
             DivergedError: if an observation, action or reward is not finite.
             ViolationError: at a violation behind the certified filter.
         """
-        self.recorder.update(batch)
-        self.check(batch)
-        check_batch(batch, self.recorder.frames)
+        if self.recorder.update(batch):
+            self.check(batch)
+            check_batch(batch, self.recorder.frames)
         if len(steps):
             self.buffer.extend(steps)
         self.batch, self.rewards = batch, rewards
@@ -307,7 +307,7 @@ def stopped_at(runs: Sequence[TrainingRun]) -> str:
 
 def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequence:
     """Each run's part of ``rows``, which hold the runs' worlds one after the other."""
-    return rows.chunk(len(runs)) if len(rows) else [rows] * len(runs)
+    return rows.chunk(len(runs)) if len(runs) > 1 and len(rows) else [rows] * len(runs)
 
 
 def minibatches(runs: Sequence[TrainingRun], count: int) -> Iterator[TensorDictBase]:

@@ -12,6 +12,7 @@ from agents.maddpg import check_loss
 from agents.pipeline import pick_device
 from envs import SurveillanceConfig
 from envs.config import check_choice, check_range
+from envs.graphs import check_graphs
 from safety import SafetyConfig
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -205,17 +206,20 @@ class Config:
     resume: str = "auto"
     """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
     the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
-    of that run's folder; only collector.total_frames, train, eval, compile and fixed_sizes may differ from its
-    settings."""
+    of that run's folder; only collector.total_frames, train, eval, compile, fixed_sizes and cuda_graphs may differ
+    from its settings."""
     deterministic: bool = False
     """Refuse operations of PyTorch that may differ between runs of the same seed (CUDA has some; slower there)."""
     compile: bool = False
-    """Run pure tensor functions of step and shield through torch.compile (a minute at the start), with fixed_sizes the whole
-    filter; same results to rounding. Where there is no C++ compiler: a warning, and as false."""
+    """Run pure tensor functions of step and shield through torch.compile (a minute at the start), with fixed_sizes all of step
+    and filter; same results to rounding. Where there is no C++ compiler: a warning, and as false."""
     fixed_sizes: bool = False
     """Compute step and filter for all robots instead of those that need it, so that no size depends on the data: the host of
     a GPU then does not wait within a step. Slower on a CPU. Where no closed form solves a program the robot holds, and where
     the shield would act all robots of that world drive home."""
+    cuda_graphs: bool = False
+    """Record what networks, filter, step and update launch on a GPU once, and launch it as one from then on. Needs fixed_sizes.
+    The same results but for roundings of the optimiser; no effect on a CPU. With safety.in_loss the update is not recorded."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
@@ -245,6 +249,7 @@ class Config:
             )
         self.safety.gains(self.env)
         self.safety.check_sizes(fixed_sizes=self.fixed_sizes)
+        check_graphs(cuda_graphs=self.cuda_graphs, fixed_sizes=self.fixed_sizes)
         check_loss(self.agent, self.safety)
         steps = self.collector.total_frames // self.collector.num_envs
         if steps < self.agent.n_steps:
@@ -258,7 +263,8 @@ class Config:
     @property
     def computing(self) -> dict[str, bool]:
         """How worlds and filter compute: arguments of :class:`envs.SurveillanceEnv` and ``make_policies``."""
-        return {"compile_functions": self.compile, "fixed_sizes": self.fixed_sizes}
+        sizes = {"fixed_sizes": self.fixed_sizes, "cuda_graphs": self.cuda_graphs}
+        return {"compile_functions": self.compile} | sizes
 
     @property
     def all_seeds(self) -> list[int]:

@@ -23,7 +23,7 @@ from agents.checkpoint import (
 )
 from agents.replay_files import ReplayFiles
 
-MAY_DIFFER = ("collector.total_frames", "train", "eval", "compile", "fixed_sizes")
+MAY_DIFFER = ("collector.total_frames", "train", "eval", "compile", "fixed_sizes", "cuda_graphs")
 """Settings that a run may change when it goes on from another run's checkpoint."""
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from torchrl.collectors import Collector
 
 from agents.config import AgentConfig
-from agents.networks import make_actor, make_policies, noises_of
+from agents.networks import make_actor, make_policies
+from agents.noise import noises_of
 from agents.pipeline import COLLECTOR_OPTIONS, use_threads
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig

@@ -27,6 +27,8 @@ NOT_HASHED = (
     *("video", "format", "samples"),  # of evaluate.py's pictures
 )
 
+COMPUTED = ("fixed_sizes", "cuda_graphs")
+"""How a run computes, where not as by default."""
 GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
 
@@ -36,11 +38,11 @@ def config_hash(cfg: DictConfig) -> str:
 
 
 def hashed_config(cfg: DictConfig) -> dict:
-    """The resolved configuration without :data:`NOT_HASHED`, nested; workers and fixed sizes only where there are some."""
+    """The resolved configuration without :data:`NOT_HASHED`, nested; workers, fixed sizes and graphs only where there are some."""
     found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
     workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
     kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
-    fixed = {"fixed_sizes": True} if found.pop("fixed_sizes", False) else {}
+    fixed = {name: True for name in COMPUTED if found.pop(name, False)}
     return found | kept | fixed
 
 
@@ -80,7 +82,7 @@ def evaluation_folder(cfg: DictConfig) -> str:
         if not any(entry.startswith("env.horizon=") for entry in overrides):
             horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
     name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
-    names = ("env", "safety", "checkpoint", *(["fixed_sizes"] if cfg.fixed_sizes else []))
+    names = ("env", "safety", "checkpoint", *(name for name in COMPUTED if cfg[name]))
     changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in names]
     if cfg.run is not None:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""

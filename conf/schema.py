@@ -69,10 +69,8 @@ def run_config(cfg: DictConfig, overrides: list[str]) -> Config:
         key = override.split("=")[0].lstrip("+~")
         if key.split(".")[0] in ("env", "safety"):
             OmegaConf.update(given, key, OmegaConf.select(cfg, key), merge=False)
-    given.device, given.fixed_sizes = (
-        cfg.device,
-        False,
-    )  # the run may have been trained elsewhere; evaluations have their own
+    given.device = cfg.device  # the run may have been trained elsewhere
+    given.fixed_sizes = given.cuda_graphs = False  # evaluations have their own
     given.workers = OmegaConf.structured(WorkersConfig)
     return to_config(given)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 WARM_UP = 3
 """Calls before the recording: they make what is made once (layouts, optimiser states, compiled code)."""
 
-Outputs = tuple[Tensor, ...] | dict[str, Tensor]
+Outputs = Tensor | tuple[Tensor, ...] | dict[str, Tensor]
 
 
 class Recording(Protocol):
@@ -47,8 +47,9 @@ class CudaRecording:
         self.graph.replay()
 
 
-RECORDINGS: dict[str, Callable[[Callable[..., Outputs], Sequence[Tensor]], Recording]] = {"cuda": CudaRecording}
-"""By type of device; on others functions are called as they are."""
+def recorder_for(tensor: Tensor) -> Callable[[Callable[..., Outputs], Sequence[Tensor]], Recording] | None:
+    """What records functions of tensors on this one's device; None where they are called as they are."""
+    return CudaRecording if tensor.is_cuda else None
 
 
 class Graphed:
@@ -59,7 +60,7 @@ class Graphed:
     gradients are never recorded.
 
     Args:
-        function: tensors in, as positional arguments; a tuple of tensors out, or a dictionary of them.
+        function: tensors in, as positional arguments; a tensor out, or a tuple or dictionary of them.
     """
 
     def __init__(self, function: Callable[..., Outputs]) -> None:
@@ -73,7 +74,7 @@ class Graphed:
 
     def __call__(self, *tensors: Tensor) -> Any:
         """The function's result, in tensors of its own."""
-        record = RECORDINGS.get(tensors[0].device.type)
+        record = recorder_for(tensors[0])
         if record is None or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
             return self.function(*tensors)
         key = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
@@ -84,13 +85,17 @@ class Graphed:
             inputs = [tensor.clone() for tensor in tensors]
             self.recordings[key] = (inputs, record(self.function, inputs))
         inputs, recording = self.recordings[key]
-        for own, given in zip(inputs, tensors, strict=True):
-            own.copy_(given)
+        torch._foreach_copy_(inputs, tensors)
         recording.replay()
-        outputs = recording.outputs
-        if isinstance(outputs, dict):
-            return {name: value.clone() for name, value in outputs.items()}
-        return tuple(value.clone() for value in outputs)
+        return _copies(recording.outputs)
+
+
+def _copies(outputs: Outputs) -> Outputs:
+    if isinstance(outputs, Tensor):
+        return outputs.clone()
+    if isinstance(outputs, dict):
+        return {name: value.clone() for name, value in outputs.items()}
+    return tuple(value.clone() for value in outputs)
 
 
 def _beside(function: Callable[..., Outputs], tensors: Sequence[Tensor]) -> Outputs:

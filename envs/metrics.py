@@ -111,18 +111,19 @@ class EpisodeTracker:
         self.violations = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self.finished: dict[str, list[float]] = {"return": [], "violations": []}
 
-    def update(self, reward: Tensor, violations: Tensor, done: Tensor) -> None:
+    def update(self, reward: Tensor, violations: Tensor, done: Tensor, *, any_done: bool = True) -> None:
         """Take in transitions in order of time.
 
         Args:
             reward: ``(B, T)``, team reward.
             violations: ``(B, T)``, violating robot-steps.
             done: ``(B, T)`` bool.
+            any_done: False if it is known that none is: the device is then not asked.
         """
         for r, v, d in zip(reward.unbind(1), violations.unbind(1), done.unbind(1), strict=True):
             self.reward += r
             self.violations += v
-            if d.any():
+            if any_done and d.any():
                 self.finished["return"] += self.reward[d].tolist()
                 self.finished["violations"] += self.violations[d].tolist()
                 self.reward[d] = 0

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from envs.config import SurveillanceConfig
-from envs.dynamics import length
+from envs.dynamics import length, other_indices
 from envs.homing import HomingGeometry, reserve
 
 
@@ -226,3 +226,10 @@ def accepted_current(row: BarrierRow, alpha: float) -> tuple[Tensor, Tensor]:
     demand = -row.current_gain
     current = torch.where(demand > supply, supply / demand.clamp_min(1e-30), torch.ones_like(supply))
     return current.clamp(0, 1), supply >= 0
+
+
+def without_self(rows: Tensor) -> Tensor:
+    """Drop the diagonal of ``(*B, N, N, k)`` rows: ``(*B, N, N - 1, k)``."""
+    n = rows.shape[-2]
+    others = other_indices(n, rows.device)
+    return rows.gather(-2, others.unsqueeze(-1).expand(*rows.shape[:-3], n, n - 1, rows.shape[-1]))

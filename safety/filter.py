@@ -27,7 +27,8 @@ from envs import keys
 from envs.battery import charge, charging_field
 from envs.compilation import compiled
 from envs.config import SurveillanceConfig
-from envs.dynamics import components_first, limit_speed, other_indices
+from envs.dynamics import components_first, limit_speed
+from envs.graphs import check_graphs, graphed
 from envs.transition import transition
 from safety.barriers import (
     BarrierRow,
@@ -36,6 +37,7 @@ from safety.barriers import (
     literature_barriers,
     overcharge_barrier,
     sampled_energy_row,
+    without_self,
 )
 from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
 from safety.certified_rows import Rows, certified_rows
@@ -67,18 +69,26 @@ class SafetyFilter(TensorDictModuleBase):
         fixed_sizes: compute everything for all robots, so that no size depends on the data and the host of a GPU never waits.
             Slower on a CPU; the same results, but where a problem has no closed form within tolerance (it counts as
             INACCURATE, infeasible ones too) and where a certificate fails (all robots of that world drive home).
+        cuda_graphs: record the kernels once and replay them (:mod:`envs.graphs`); needs ``fixed_sizes``.
 
     The position's type and device are the filter's; other inputs are converted to its type.
 
     Raises:
-        ValueError: if a gain does not fit the world's time step or certificate, or ``fixed_sizes`` the solver.
+        ValueError: if a gain does not fit the world's time step or certificate, or ``fixed_sizes`` the solver or the graphs.
         KeyError: from ``forward``, if an input key is missing.
     """
 
     def __init__(
-        self, safety: SafetyConfig, world: SurveillanceConfig, *, compile: bool = False, fixed_sizes: bool = False
+        self,
+        safety: SafetyConfig,
+        world: SurveillanceConfig,
+        *,
+        compile: bool = False,
+        fixed_sizes: bool = False,
+        cuda_graphs: bool = False,
     ) -> None:
         super().__init__()
+        check_graphs(cuda_graphs=cuda_graphs, fixed_sizes=fixed_sizes)
         safety.check_sizes(fixed_sizes=fixed_sizes)
         self.safety = safety
         self.world = world
@@ -95,9 +105,10 @@ class SafetyFilter(TensorDictModuleBase):
         if safety.mode == "certified":
             self.out_keys.append(keys.BARRIER_CERTIFICATE)
         self._transition = compiled(functools.partial(transition, config=world), enabled=compile and not fixed_sizes)
-        self._filter = compiled(self.filter, enabled=compile and fixed_sizes, dynamic=False)
+        whole = compiled(self.filter, enabled=compile and fixed_sizes, dynamic=False)
+        self._filter = graphed(whole, enabled=cuda_graphs)
         self.layer = DalalLayer(safety, world) if safety.mode == "dalal" else None
-        self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
+        self._layouts: dict[tuple[torch.device, torch.dtype], tuple[Tensor, ...]] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Filter the nominal action of ``tensordict`` and write the results into it."""
@@ -252,8 +263,8 @@ class SafetyFilter(TensorDictModuleBase):
             action, status, residual = self._solve_joint(target, gain_c, bound_c, gain_s, bound_s)
         else:
             share = 1.0 if self.safety.split == "full" else 0.5
-            G = torch.cat([gain_c.unsqueeze(-2), _without_self(gain_s)], dim=-2)
-            h = torch.cat([bound_c.unsqueeze(-1), share * _without_self(bound_s.unsqueeze(-1)).squeeze(-1)], dim=-1)
+            G = torch.cat([gain_c.unsqueeze(-2), without_self(gain_s)], dim=-2)
+            h = torch.cat([bound_c.unsqueeze(-1), share * without_self(bound_s.unsqueeze(-1)).squeeze(-1)], dim=-1)
             action, status, residual = self._solve_per_robot(target, G, h)
         status = torch.where(impossible, int(QPStatus.INFEASIBLE), status)
         return action, current, status, residual
@@ -339,22 +350,11 @@ class SafetyFilter(TensorDictModuleBase):
         home = self._layout(position)[1][slot]
         return literature_barriers(position, energy, home, self._field(position), self.literal, self.world)
 
-    def _layout(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _layout(self, like: Tensor) -> tuple[Tensor, ...]:
         """Stations, slots and arena on the device and in the type of ``like``. Not buffers: the loss must not copy them."""
         key = (like.device, like.dtype)
         if key not in self._layouts:
-            factory = {"dtype": like.dtype, "device": like.device}
             world = self.world
-            self._layouts[key] = (
-                torch.tensor(world.station_positions, **factory),
-                torch.tensor(world.slot_positions, **factory),
-                torch.tensor(world.bounds, **factory),
-            )
+            given = (world.station_positions, world.slot_positions, world.bounds)
+            self._layouts[key] = tuple(torch.tensor(part, dtype=like.dtype, device=like.device) for part in given)
         return self._layouts[key]
-
-
-def _without_self(rows: Tensor) -> Tensor:
-    """Drop the diagonal of ``(*B, N, N, k)`` rows: ``(*B, N, N - 1, k)``."""
-    n = rows.shape[-2]
-    others = other_indices(n, rows.device)
-    return rows.gather(-2, others.unsqueeze(-1).expand(*rows.shape[:-3], n, n - 1, rows.shape[-1]))

@@ -55,6 +55,11 @@ class FilterStatistics:
 
     def measure(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, float]:
         """What :meth:`add` takes of filter outputs, as :meth:`update`'s; waits for the device once."""
+        found = self.numbers(tensordict, alive)
+        return dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))
+
+    def numbers(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, Tensor]:
+        """What :meth:`measure` reads, each ``()`` float64."""
         status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
         correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
         counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
@@ -68,13 +73,13 @@ class FilterStatistics:
             counts & tensordict[keys.OUTSIDE],
             counts & (level == HOMING),
         )
-        found = dict(zip(self.sums, (row.sum(dtype=torch.float64) for row in rows), strict=True))
+        found: dict[str, Tensor] = dict(zip(self.sums, (row.sum(dtype=torch.float64) for row in rows), strict=True))
         found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
         margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
         for name, x in margins.items():
             if x is not None:
                 found[name] = torch.where(counts, x.squeeze(-1), torch.inf).min().double()
-        return dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))
+        return found
 
     def add(self, found: dict[str, float]) -> None:
         """Add what :meth:`measure` found."""

@@ -15,11 +15,13 @@ from agents.collection import make_collection
 from agents.config import AgentConfig
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import make_policies, noises_of
+from agents.networks import make_policies
+from agents.noise import noises_of
 from agents.pipeline import to_transitions
 from agents.training_config import Config
-from envs import SurveillanceConfig, SurveillanceEnv, keys
+from envs import SurveillanceConfig, SurveillanceEnv, graphs, keys
 from safety import SafetyConfig, SafetyFilter
+from tests.test_graphs import trained
 from tests.test_synchronisation import MOST
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
@@ -113,3 +115,39 @@ def test_collecting_waits_for_the_device_no_more_often_than_counted_on_a_cpu(set
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert (counts[1] - counts[0]) / 20 <= most
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("n_seeds", [1, 2])
+@pytest.mark.parametrize("split", ["auto", "half"])
+def test_training_by_graphs_is_the_same(n_seeds, split, monkeypatch):
+    settings = {"agent": AgentConfig(n_steps=1), "safety": SafetyConfig(split=split)}
+    made = []
+
+    class Counted(graphs.CudaRecording):
+        def __init__(self, *given):
+            super().__init__(*given)
+            made.append(self)
+
+    monkeypatch.setattr(graphs, "CudaRecording", Counted)
+    found = trained(16, n_seeds, torch.device("cuda"), **settings)
+    assert len(made) == 5  # actor, filter, step, counting and update
+    monkeypatch.setattr(graphs, "recorder_for", lambda tensor: None)
+    expected = trained(16, n_seeds, torch.device("cuda"), **settings)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+
+
+@pytest.mark.gpu
+def test_a_run_by_graphs(program, tmp_path):
+    arguments = (
+        "experiment=smoke",
+        "n_seeds=2",
+        "device=cuda",
+        "fixed_sizes=true",
+        "cuda_graphs=true",
+        "log.gif=false",
+    )
+    code, output = program(train.main, *arguments)
+    assert code == 0, output
+    summaries = [json.loads(path.read_text()) for path in tmp_path.glob("runs/smoke/*/summary.json")]
+    assert [sum(summary["train"]["violations"].values()) for summary in summaries] == [0, 0]

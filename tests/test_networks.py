@@ -13,12 +13,12 @@ from agents.networks import (
     BallActor,
     BatchedMLP,
     Critic,
-    ExplorationNoise,
     joint_action,
     make_actor,
     make_critic,
     make_policies,
 )
+from agents.noise import ExplorationNoise
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 

@@ -23,15 +23,13 @@ def test_divergence_is_named():
         check_finite({"actor": 1.0, "value": float("nan"), "q_value": float("inf")}, 7)
 
 
-def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
-    world = SurveillanceConfig(n_agents=2)
-    recorder = TrainingRecorder(world, 1, None)
+def counted_batch():
+    """One world, two robots, two steps, of which the last ends the episode; nothing is wrong."""
+    zeros, vectors = torch.zeros(1, 2, 2), torch.zeros(1, 2, 2, 2)
     flags = {kind: torch.zeros(1, 2, 2, 1, dtype=torch.bool) for kind in keys.VIOLATION_KINDS}
-    flags["depleted"][0, 1, 0] = flags["stranded"][0, 1, 0] = True  # robot 0 at the second step, twice at once
-    flags["collision"][0, 1] = True  # and both robots collide
-    zeros = torch.zeros(1, 2, 2)
-    batch = TensorDict(
+    return TensorDict(
         {
+            **{key: vectors.clone() for key in WATCHED.values()},
             ("next", *keys.REWARD): torch.full((1, 2, 2, 1), -0.5),
             ("next", "done"): torch.tensor([[[False], [True]]]),
             ("next", keys.COVERAGE_COST): torch.full((1, 2, 1), 0.3),
@@ -42,6 +40,29 @@ def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
         },
         (1, 2),
     )
+
+
+def test_a_batch_with_something_wrong_is_to_be_looked_at():
+    recorder = TrainingRecorder(SurveillanceConfig(n_agents=2), 1, None)
+    assert not recorder.update(counted_batch())
+    for key in [keys.OUTSIDE, *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS)]:
+        batch = counted_batch()
+        batch[key][0, 1, 0] = True
+        assert recorder.update(batch), key
+    for key in WATCHED.values():
+        for bad in (float("nan"), float("inf"), -float("inf")):
+            batch = counted_batch()
+            batch[key][0, 0, 1] = bad
+            assert recorder.update(batch), key
+    assert not recorder.update(counted_batch())
+
+
+def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
+    world = SurveillanceConfig(n_agents=2)
+    recorder, batch = TrainingRecorder(world, 1, None), counted_batch()
+    flags = {kind: batch[("next", *keys.VIOLATION, kind)] for kind in keys.VIOLATION_KINDS}
+    flags["depleted"][0, 1, 0] = flags["stranded"][0, 1, 0] = True  # robot 0 at the second step, twice at once
+    flags["collision"][0, 1] = True  # and both robots collide
     recorder.update(batch)
     assert recorder.violations == {"depleted": 1, "stranded": 1, "overcharged": 0, "collision": 2}
     assert recorder.episodes.finished == {"return": [-1.0], "violations": [2.0]}

@@ -14,7 +14,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from agents.collection import make_collection
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import make_policies, noises_of
+from agents.networks import make_policies
+from agents.noise import noises_of
 from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config

@@ -53,7 +53,8 @@ from agents.divergence import check_batch
 from agents.incident import check_violations
 from agents.learners import make_learners
 from agents.maddpg import update_step
-from agents.networks import make_policies, noises_of
+from agents.networks import make_policies
+from agents.noise import noises_of
 from agents.pipeline import MultiStep, draw, make_buffer, to_transitions, use_threads
 from agents.recorder import Seconds, TrainingRecorder
 from agents.training_config import Config
@@ -232,9 +233,9 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     def count(batch: TensorDictBase) -> None:
         seconds.spent("collect")
         for recorder, own in zip(recorders, batch.chunk(n_seeds), strict=True):
-            recorder.update(own)
-            check_violations(own, world=config.env, safety=config.safety, folder=folder)
-            check_batch(own, recorder.frames)
+            if recorder.update(own):
+                check_violations(own, world=config.env, safety=config.safety, folder=folder)
+                check_batch(own, recorder.frames)
 
     def store(batch: TensorDictBase) -> None:
         steps = multi_step(to_transitions(batch, config.train.violation_penalty))

@@ -1,0 +1,60 @@
+"""A recording without a GPU: the operations of a function on tensors, done again in the same memory, as a CUDA graph does.
+
+Nothing of Python runs at a replay, arguments that are numbers stay what they were, and tensors keep their memory. What a
+CUDA graph cannot hold, numbers read by the host, sizes that depend on the data, tensors made from the host's numbers and random
+numbers, raises here too.
+"""
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+ATEN = torch.ops.aten
+NOT_RECORDABLE = {
+    *(ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal, ATEN.repeat_interleave, ATEN._unique2),
+    *(ATEN.lift_fresh, ATEN.rand, ATEN.randn, ATEN.randint, ATEN.randperm, ATEN.uniform_, ATEN.normal_),
+}
+INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
+
+
+class StandInRecording(TorchDispatchMode):
+    """As :class:`envs.graphs.CudaRecording`, on any device.
+
+    Args:
+        function: what is recorded, and carried out; the first replay only says so.
+        inputs: its arguments.
+    """
+
+    made = 0
+    replays = 0
+
+    def __init__(self, function, inputs):
+        super().__init__()
+        self.operations = []
+        self.done = True
+        with self:
+            self.outputs = function(*inputs)
+        StandInRecording.made += 1
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        packet = func.overloadpacket
+        masked = packet in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
+        if packet in NOT_RECORDABLE or masked:
+            raise RuntimeError(f"{func} cannot be recorded")
+        out = func(*args, **(kwargs or {}))
+        self.operations.append((func, args, kwargs or {}, out))
+        return out
+
+    @torch.no_grad()
+    def replay(self):
+        StandInRecording.replays += 1
+        if self.done:
+            self.done = False
+            return
+        for func, args, kwargs, out in self.operations:
+            for old, new in zip(tree_leaves(out), tree_leaves(func(*args, **kwargs)), strict=True):
+                if (
+                    isinstance(old, torch.Tensor)
+                    and old.untyped_storage().data_ptr() != new.untyped_storage().data_ptr()
+                ):
+                    old.copy_(new)  # elsewhere a view, or written in place
