@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import TensorDictRoundRobinWriter
 
 from agents.adversary_reward import AdversaryReward
 from envs import SurveillanceEnv, keys
@@ -104,10 +105,26 @@ def collect(
         collector.shutdown()
 
 
+class SliceWriter(TensorDictRoundRobinWriter):
+    """TorchRL's round robin, which writes rows that lie one after the other as a slice: faster, and without a wait for the GPU."""
+
+    def extend(self, data: TensorDictBase) -> torch.Tensor:
+        """Write ``data`` ``(M,)``; returns the rows' places ``(M,)``."""
+        start, stop, size = self._cursor, self._cursor + len(data), self._storage.max_size
+        if stop > size:
+            return super().extend(data)
+        index = torch.arange(start, stop, device=data.device)
+        self._cursor, self._write_count = stop % size, self._write_count + len(data)
+        self._storage.set(slice(start, stop), data.set("index", index))
+        self._mark_update_entities(index)
+        return index
+
+
 def make_buffer(capacity: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
     """Uniform replay with its own generator. It holds the executed action and every key that the filter reads."""
     generator = torch.Generator(device=device).manual_seed(seed)  # the storage draws rows where it lies
-    return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity, device=device), generator=generator)
+    storage = LazyTensorStorage(capacity, device=device)
+    return TensorDictReplayBuffer(storage=storage, writer=SliceWriter(), generator=generator)
 
 
 def draw(buffer: TensorDictReplayBuffer, count: int, reads: Sequence[NestedKey]) -> TensorDictBase:

@@ -2,7 +2,8 @@
 
 Training as a whole against TorchRL's MADDPG on VMAS simple_spread (needs vmas: ``pip install -e .[bench]``), 3 robots, one
 process, the contestants in turn, medians of the rounds. One round of each is ``--steps`` vector steps of its worlds and
-``train.n_updates`` updates per vector step; ten seeds take a fifth as many. Other words are overrides of train.py.
+``train.n_updates`` updates per vector step; ten seeds take a fifth as many. Other words are overrides of
+train.py, such as ``device=cuda fixed_sizes=true cuda_graphs=true``: all contestants are then on the GPU.
 
 The baseline does what TorchRL's sota-implementations/multiagent/maddpg_iddpg.py does, written anew from the public interfaces
 of TorchRL: VmasEnv with RewardSum, MultiAgentMLP actor (TanhDelta, AdditiveGaussianModule) and centralised critic, Collector,
@@ -28,7 +29,6 @@ import argparse
 import logging
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,11 +51,10 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 from agents.collection import make_collection
 from agents.divergence import check_batch
 from agents.incident import check_violations
-from agents.learners import make_learners
-from agents.maddpg import update_step
+from agents.learners import make_learners, make_update
 from agents.networks import make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, to_transitions, use_threads
+from agents.pipeline import MultiStep, draw, make_buffer, pick_device, to_transitions, use_threads
 from agents.recorder import Seconds, TrainingRecorder
 from agents.training_config import Config
 from conf.schema import register, to_config
@@ -80,6 +79,7 @@ class Contestant:
         update: learns from one.
         end: called after the updates of a batch.
         count: counts and checks a batch.
+        device: waited for at the end of each part.
     """
 
     def __init__(
@@ -92,7 +92,9 @@ class Contestant:
         update: Callable[[TensorDictBase], object],
         end: Callable[[], object] = lambda: None,
         count: Callable[[TensorDictBase], object] = lambda batch: None,
+        device: str = "cpu",
     ) -> None:
+        self.device = device
         self.batches, self.frames, self.updates = batches, frames, updates
         self.store, self.sample, self.update = store, sample, update
         self.end, self.count = end, count
@@ -100,11 +102,11 @@ class Contestant:
     def run(self, batches: int) -> dict[str, float]:
         """Seconds per frame of each part, over a number of batches."""
         spent = dict.fromkeys(PARTS, 0.0)
-        mark = time.perf_counter()
+        mark = harness.clock(self.device)
 
         def done(part: str) -> None:
             nonlocal mark
-            now = time.perf_counter()
+            now = harness.clock(self.device)
             spent[part] += now - mark
             mark = now
 
@@ -130,13 +132,14 @@ def baseline(config: Config, steps: int) -> Contestant:
     """TorchRL's MADDPG on VMAS with batches of ``steps`` vector steps; several: the replay is the batch, as in the script."""
     torch.manual_seed(0)
     worlds, agent, n_agents = config.collector.num_envs, config.agent, config.env.n_agents
+    device = pick_device(config.device)
     vmas = VmasEnv(
         "simple_spread",
         num_envs=worlds,
         n_agents=n_agents,
         continuous_actions=True,
         max_steps=100,
-        device="cpu",
+        device=device,
         seed=0,
     )
     env = TransformedEnv(vmas, RewardSum(in_keys=[vmas.reward_key], out_keys=[("agents", "episode_reward")]))
@@ -151,6 +154,7 @@ def baseline(config: Config, steps: int) -> Contestant:
             share_params=shared,
             num_cells=cells,
             activation_class=nn.ReLU,
+            device=device,
         )
 
     actor = network(n_observation, n_action, agent.actor_cells, centralized=False)
@@ -165,7 +169,7 @@ def baseline(config: Config, steps: int) -> Contestant:
         return_log_prob=False,
     )
     annealing = config.collector.total_frames // 2
-    noise = AdditiveGaussianModule(spec=spec, annealing_num_steps=annealing, action_key=action_key)
+    noise = AdditiveGaussianModule(spec=spec, annealing_num_steps=annealing, action_key=action_key, device=device)
     value = ("agents", "state_action_value")
     critic = ValueOperator(
         network(n_observation + n_action, 1, agent.critic_cells, centralized=True),
@@ -181,10 +185,10 @@ def baseline(config: Config, steps: int) -> Contestant:
 
     frames, updates = worlds * steps, config.train.n_updates * steps
     explore = TensorDictSequential(policy, noise)
-    options = {"postproc": done_of_agents, "auto_register_policy_transforms": False}
+    options = {"postproc": done_of_agents, "auto_register_policy_transforms": False, "device": device}
     collector = Collector(env, explore, frames_per_batch=frames, total_frames=-1, **options)
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(frames if steps > 1 else config.buffer.capacity),
+        storage=LazyTensorStorage(frames if steps > 1 else config.buffer.capacity, device=device),
         sampler=SamplerWithoutReplacement() if steps > 1 else RandomSampler(),
         batch_size=config.buffer.batch_size,
     )
@@ -209,22 +213,27 @@ def baseline(config: Config, steps: int) -> Contestant:
     def store(batch: TensorDictBase) -> None:
         buffer.extend(batch.reshape(-1))
 
-    return Contestant(iter(collector), frames, updates, store, buffer.sample, update, end)
+    parts = (store, buffer.sample, update, end)
+    return Contestant(iter(collector), frames, updates, *parts, device=device.type)
 
 
 # ---- ours -----------------------------------------------------------------------------------------------------------
 def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     """The loop of train.py, and the clock that watches the parts of its collection."""
-    seeds, device, worlds = list(range(n_seeds)), torch.device("cpu"), config.collector.num_envs
+    seeds, device, worlds = list(range(n_seeds)), pick_device(config.device), config.collector.num_envs
     n_observation = SurveillanceEnv(config.env).n_observation
-    learners, learner = make_learners(n_observation, config.env, config.agent, config.safety, device, seeds=seeds)
-    _, explore = make_policies(learner.actor, config.env, config.safety, config.agent, seeds, device)
+    arguments, graphs = (config.env, config.agent, config.safety, device), {"cuda_graphs": config.cuda_graphs}
+    learners, learner = make_learners(n_observation, *arguments, seeds=seeds, **graphs)
+    update = make_update(learner, config.agent, config.safety, **graphs)
+    _, explore = make_policies(
+        *(learner.actor, config.env, config.safety, config.agent, seeds, device), **config.computing
+    )
     noises = noises_of(explore)
     collection = make_collection(config, seeds, learners, explore, noises, device, print)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
     minibatch = config.buffer.batch_size
     buffers = [make_buffer(config.buffer.capacity, device, seed) for seed in seeds]
-    recorders = [TrainingRecorder(config.env, worlds, device) for _ in seeds]
+    recorders = [TrainingRecorder(config.env, worlds, device, **graphs) for _ in seeds]
     folder = Path(tempfile.gettempdir())  # of violation.json; a violation ends the program
     seconds = Seconds("collect")
     seconds.watch("policy", explore)
@@ -257,10 +266,8 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
         store(next(batches))
 
-    def update(minibatch: TensorDictBase) -> None:
-        update_step(minibatch, *learner.updates, config.agent)
-
-    return Contestant(batches, per_batch, updates, store, sample, update, count=count), seconds
+    contestant = Contestant(batches, per_batch, updates, store, sample, update, count=count, device=device.type)
+    return contestant, seconds
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------
@@ -354,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options, overrides = parser.parse_known_args(arguments)
     use_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    print(f"{harness.machine('cpu')}\n")
+    print(f"{harness.machine(pick_device(composed(*overrides).device).type)}\n")
     header = (
         *(
             "worlds",
