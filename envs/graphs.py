@@ -55,7 +55,8 @@ def recorder_for(tensor: Tensor) -> Callable[[Callable[..., Outputs], Sequence[T
 class Graphed:
     """A function of tensors, recorded at the fourth call with arguments of the same shapes and replayed from then on.
 
-    The same kernels on the same numbers: the function's own results, bit for bit. It may write into tensors that it holds
+    The same kernels on the same numbers: the function's own results (but for cuBLAS, which rounds differently on other streams).
+    It may write into tensors that it holds
     (networks, moments), but must neither draw random numbers nor ask for a tensor's value. Calls whose arguments need
     gradients are never recorded.
 
