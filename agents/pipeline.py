@@ -9,6 +9,7 @@ from typing import cast
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import TensorDictRoundRobinWriter
@@ -175,8 +176,8 @@ class MultiStep:
 
     def __init__(self, n_steps: int, gamma: float, n_blocks: int = 1) -> None:
         self.n_steps, self.gamma = n_steps, gamma
-        self.waiting: TensorDictBase | None = None
-        """Of all blocks, one after the other."""
+        self.waiting: dict[NestedKey, Tensor] = {}
+        """By key, ``(num_envs, <= n_steps - 1, ...)``: of all blocks, one after the other."""
         self.blocks = [WaitingSteps(self, k) for k in range(n_blocks)]
 
     def __call__(self, transitions: TensorDictBase) -> TensorDictBase:
@@ -184,19 +185,19 @@ class MultiStep:
         if self.n_steps == 1:
             return transitions.reshape(-1)
         if restored := [block.restored for block in self.blocks if block.restored is not None]:
-            self.waiting = cast(TensorDictBase, torch.cat(restored)).to(transitions.device)  # pyright: ignore[reportArgumentType]
+            self.waiting = leaves(cast(TensorDictBase, torch.cat(restored)).to(transitions.device))  # pyright: ignore[reportArgumentType]
             for block in self.blocks:
                 block.restored = None
-        if self.waiting is None:
-            window = transitions.clone()  # the collector may write into its own
-        else:
-            window = cast(TensorDictBase, torch.cat([self.waiting, transitions], dim=1))  # pyright: ignore[reportArgumentType]
-        self.waiting = window[:, max(0, window.shape[1] - self.n_steps + 1) :]
-        length = window.shape[1] - self.n_steps + 1
+        window = {  # tensors of its own: the collector writes into the batch
+            key: torch.cat([self.waiting[key], new], dim=1) if self.waiting else new.clone()
+            for key, new in leaves(transitions).items()
+        }
+        reward, done = window["next", *keys.REWARD], window["next", "done"].squeeze(-1)
+        worlds, steps = done.shape
+        self.waiting = {key: rows[:, max(0, steps - self.n_steps + 1) :] for key, rows in window.items()}
+        length = steps - self.n_steps + 1
         if length <= 0:
             return transitions.reshape(-1)[:0]
-        following = window["next"]
-        reward, done = following[keys.REWARD], following["done"].squeeze(-1)
         total, goes_on = reward[:, :length], ~done[:, :length]
         ahead = torch.zeros_like(goes_on, dtype=torch.int64)  # of the last step of each transition
         for k in range(1, self.n_steps):
@@ -204,9 +205,20 @@ class MultiStep:
             total = total + torch.where(goes_on[..., None, None], self.gamma**k * reward[:, later], 0.0)
             ahead = ahead + goes_on
             goes_on = goes_on & ~done[:, later]
-        last = following.gather(1, torch.arange(length, device=done.device) + ahead).set(keys.REWARD, total)
-        steps = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
-        return window[:, :length].exclude("next").set(STEPS, steps).set("next", last).reshape(-1)
+        row = torch.arange(worlds, device=done.device).unsqueeze(-1) * steps
+        last = (row + torch.arange(length, device=done.device) + ahead).flatten()
+        found = {
+            key: rows.flatten(0, 1).index_select(0, last) if key[0] == "next" else rows[:, :length].flatten(0, 1)
+            for key, rows in window.items()
+        }
+        taken = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
+        found |= {("next", *keys.REWARD): total.flatten(0, 1), STEPS: taken.flatten(0, 1)}
+        return TensorDict(found, [worlds * length], transitions.device)
+
+
+def leaves(rows: TensorDictBase) -> dict[NestedKey, Tensor]:
+    """Tensors of a tensordict by key, nested keys as tuples."""
+    return dict(rows.items(include_nested=True, leaves_only=True))
 
 
 class WaitingSteps:
@@ -225,8 +237,9 @@ class WaitingSteps:
     def state_dict(self) -> dict:
         """The steps that wait."""
         waiting, others = self.restored, self.multi_step
-        if waiting is None and others.waiting is not None:
-            waiting = others.waiting.chunk(len(others.blocks))[self.k].clone()
+        if waiting is None and others.waiting:
+            shape = others.waiting["next", "done"].shape[:2]
+            waiting = TensorDict(others.waiting, shape).chunk(len(others.blocks))[self.k].clone()
         return {"waiting": None} if waiting is None else {"waiting": waiting.to_dict(), "shape": list(waiting.shape)}
 
     def load_state_dict(self, state: dict) -> None:

@@ -14,6 +14,8 @@ from torch import Tensor
 
 WARM_UP = 3
 """Calls before the recording: they make what is made once (layouts, optimiser states, compiled code)."""
+MOST = 16
+"""Recordings of a function, each of which holds memory; other shapes are then computed as without."""
 
 Outputs = Tensor | tuple[Tensor, ...] | dict[str, Tensor]
 
@@ -80,6 +82,8 @@ class Graphed:
             return self.function(*tensors)
         key = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
         if key not in self.recordings:
+            if len(self.recordings) == MOST:
+                return self.function(*tensors)
             self.calls[key] += 1
             if self.calls[key] <= WARM_UP:
                 return _beside(self.function, tensors)

@@ -2,17 +2,19 @@
 
 import pytest
 import torch
+from tensordict.nn import TensorDictSequential
 
 from agents.collection import make_collection
 from agents.config import AgentConfig
+from agents.evaluation import evaluate_policy
 from agents.learners import make_learners, make_update
-from agents.networks import make_policies
+from agents.networks import acting, make_actor, make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, graphs
-from envs.graphs import WARM_UP, Graphed
+from envs.graphs import MOST, WARM_UP, Graphed
 from safety import SafetyConfig, SafetyFilter
 from tests.standin_recording import StandInRecording
 
@@ -50,6 +52,14 @@ def test_a_function_is_recorded_once_per_shape(recording):
     for _ in range(5):
         fast(torch.ones(4), torch.ones(1))
     assert len(calls) == 2 * (WARM_UP + 1)
+
+
+def test_there_are_not_more_and_more_recordings(recording):
+    fast = Graphed(lambda x: x + 1)
+    for size in range(1, MOST + 9):
+        for _ in range(WARM_UP + 2):
+            assert fast(torch.ones(size)).tolist() == size * [2]
+    assert StandInRecording.made == MOST
 
 
 def test_gradients_are_not_recorded(recording):
@@ -129,6 +139,29 @@ def test_training_is_the_same(recording, settings, recordings, monkeypatch):
     monkeypatch.setattr(graphs, "recorder_for", lambda tensor: None)
     expected = trained(16, **settings)
     assert not [name for name, value in expected.items() if not torch.equal(found[name], value)]
+
+
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize("mode", ["certified", "none"])
+def test_evaluation_is_the_same(recording, restart, mode, monkeypatch):
+    world, safety = SurveillanceConfig(density="moving"), SafetyConfig(mode=mode)
+    actor = make_actor(SurveillanceEnv(world).n_observation, world, AgentConfig())
+
+    def evaluated() -> tuple:
+        sizes = {"fixed_sizes": True, "cuda_graphs": True}
+        env = SurveillanceEnv(world, 6, seed=2, **sizes)
+        policy = TensorDictSequential(acting(actor, cuda_graphs=True), SafetyFilter(safety, world, **sizes))
+        found = [evaluate_policy(env, policy, 60, record=True, restart=restart) for _ in range(2)]
+        return [metrics | statistics for metrics, statistics, _ in found], found[1][2].position
+
+    with torch.no_grad():
+        found, positions = evaluated()
+        assert StandInRecording.made == 3  # actor, filter and step
+        monkeypatch.setattr(graphs, "recorder_for", lambda tensor: None)
+        expected, expected_positions = evaluated()
+    assert found == expected
+    assert (positions == expected_positions).all()
+    assert sum(expected[0]["violations"].values()) > 0 or mode == "certified"
 
 
 def test_graphs_need_fixed_sizes():

@@ -25,7 +25,7 @@ CPU = torch.device("cpu")
 ATEN = torch.ops.aten
 WAITS = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal, ATEN.repeat_interleave, ATEN._unique2}
 INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
-MOST = {"collect": 18, "count": 3, "store": 1, "update": 0}
+MOST = {"collect": 18, "count": 1, "store": 0, "update": 0}
 """Waits of an iteration without resets. Of collecting, two are TorchRL's (is any world done?), the others select the worlds,
 pairs and rows that the filter and the reassignment of slots have to look at."""
 
