@@ -42,7 +42,10 @@ class Collection(Protocol):
         ...
 
     def batches(self, frames: int, *, resumed: bool) -> Generator[TensorDictBase, None, None]:
-        """Batches ``(seeds * num_envs, T)`` until there are so many frames, each seed's worlds after the other's."""
+        """Batches ``(seeds * num_envs, T)`` until there are so many frames, each seed's worlds after the other's.
+
+        A batch may be gone once the next one is asked for.
+        """
         ...
 
 

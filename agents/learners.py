@@ -162,5 +162,5 @@ def make_update(
         observation = tensors[0]
         return update(TensorDict(dict(zip(reads, tensors, strict=True)), observation.shape[:-2], observation.device))
 
-    recorded = Graphed(update_on)
+    recorded = Graphed(update_on, learns=True)
     return lambda minibatch: recorded(*(minibatch[key] for key in reads))

@@ -141,6 +141,7 @@ class TrainingRecorder:
         self.best_cost = cost
         return True
 
+    @torch.no_grad()
     def update(self, batch: TensorDictBase) -> bool:
         """Take in a collected batch ``(num_envs, T)``; waits for the device once (and where episodes end).
 
@@ -177,9 +178,8 @@ class TrainingRecorder:
         found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
         found |= self.filter.numbers(batch)
         self._names = list(found)
-        return torch.stack(list(found.values())), torch.stack(flags).any(dim=0).sum(
-            -1
-        )  # a robot may violate twice at once
+        violating = torch.stack(flags).any(dim=0).sum(-1)  # a robot may violate twice at once
+        return torch.stack(list(found.values())), violating
 
     def _count_tensors(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         return self._counts(TensorDict(dict(zip(self._keys, tensors, strict=True)), tensors[0].shape[:2]))

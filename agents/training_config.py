@@ -218,8 +218,9 @@ class Config:
     a GPU then does not wait within a step. Slower on a CPU. Where no closed form solves a program the robot holds, and where
     the shield would act all robots of that world drive home."""
     cuda_graphs: bool = False
-    """Record what networks, filter, step and update launch on a GPU once, and launch it as one from then on. Needs fixed_sizes.
-    The same results but for roundings of the optimiser; no effect on a CPU. With safety.in_loss the update is not recorded."""
+    """Record what networks, filter, step, counting and update launch on a GPU once, and launch it as one from then on. Needs
+    fixed_sizes. The same results to rounding. On a CPU nothing is recorded (the optimiser is the fused one, other roundings);
+    with safety.in_loss the update is not."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)

@@ -43,8 +43,11 @@ def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:
 
 
 def constant(make: Callable[..., T]) -> Callable[..., T]:
-    """Decorate a function of hashable arguments that returns tensors: made once, and fit for autograd whoever asks first."""
-    cached = functools.lru_cache(maxsize=64)(torch.inference_mode(False)(make))
+    """Decorate a function of hashable arguments that returns tensors: made once, and fit for autograd whoever asks first.
+
+    Kept for good: a recording (:mod:`envs.graphs`) knows them by their addresses.
+    """
+    cached = functools.cache(torch.inference_mode(False)(make))
 
     @torch.compiler.assume_constant_result
     @functools.wraps(make)

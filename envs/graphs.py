@@ -5,6 +5,8 @@ recorded is the kernels with the addresses they read and write, so nothing in th
 numbers themselves (:mod:`envs.selection`), and what it reads besides its arguments must stay where it is.
 """
 
+import functools
+import gc
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -40,9 +42,14 @@ class CudaRecording:
     """
 
     def __init__(self, function: Callable[..., Outputs], inputs: Sequence[Tensor]) -> None:
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.device(inputs[0].device), torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
-            self.outputs = function(*inputs)
+        self.graph, collects = torch.cuda.CUDAGraph(), gc.isenabled()
+        gc.disable()  # it might free another graph, which must not happen now
+        try:
+            with torch.cuda.device(inputs[0].device), torch.cuda.graph(self.graph, capture_error_mode="thread_local"):
+                self.outputs = function(*inputs)
+        finally:
+            if collects:
+                gc.enable()
 
     def replay(self) -> None:
         """Launch it."""
@@ -58,29 +65,29 @@ class Graphed:
     """A function of tensors, recorded at the fourth call with arguments of the same shapes and replayed from then on.
 
     The same kernels on the same numbers: the function's own results (but for cuBLAS, which rounds differently on other streams).
-    It may write into tensors that it holds
-    (networks, moments), but must neither draw random numbers nor ask for a tensor's value. Calls whose arguments need
-    gradients are never recorded.
+    It may write into tensors that it holds (networks, moments), but must neither draw random numbers nor ask for a tensor's value.
 
     Args:
         function: tensors in, as positional arguments; a tensor out, or a tuple or dictionary of them.
+        learns: whether it computes gradients itself and returns none. Another function is recorded only where gradients are off.
     """
 
-    def __init__(self, function: Callable[..., Outputs]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Outputs], *, learns: bool = False) -> None:
+        self.function, self.learns = function, learns
         self.calls: Counter[tuple] = Counter()
         self.recordings: dict[tuple, tuple[list[Tensor], Recording]] = {}
 
     def __reduce__(self) -> tuple[Callable, tuple]:
         """Copies and pickles record anew."""
-        return Graphed, (self.function,)
+        return functools.partial(Graphed, learns=self.learns), (self.function,)
 
     def __call__(self, *tensors: Tensor) -> Any:
         """The function's result, in tensors of its own."""
         record = recorder_for(tensors[0])
-        if record is None or (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        if record is None or (torch.is_grad_enabled() and not self.learns):
             return self.function(*tensors)
-        key = tuple((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
+        sizes = ((tensor.shape, tensor.dtype, tensor.device) for tensor in tensors)
+        key = (torch.is_inference_mode_enabled(), *sizes)
         if key not in self.recordings:
             if len(self.recordings) == MOST:
                 return self.function(*tensors)

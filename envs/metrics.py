@@ -46,7 +46,7 @@ def violations(
     return dict(zip(VIOLATION_KINDS, flags, strict=True))
 
 
-@functools.lru_cache(maxsize=64)
+@functools.cache  # for good, as a recording knows them by their addresses
 def _made_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j

@@ -131,7 +131,7 @@ class SurveillanceEnv(EnvBase):
         observation = self._observe(*(state[name] for name in STATE), centroid)
         nobody = torch.zeros((*self._robots, len(keys.VIOLATION_KINDS)), dtype=torch.bool, device=self.device)
         never = torch.zeros_like(mask).reshape(-1, 1)
-        return self._outputs(observation, cost, nobody, never, never)
+        return self._outputs(observation, cost, nobody, never, never.clone())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         current = tensordict.get(keys.CHARGE_CURRENT, None)

@@ -10,10 +10,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 ATEN = torch.ops.aten
-NOT_RECORDABLE = {
-    *(ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal, ATEN.repeat_interleave, ATEN._unique2),
-    *(ATEN.lift_fresh, ATEN.rand, ATEN.randn, ATEN.randint, ATEN.randperm, ATEN.uniform_, ATEN.normal_),
-}
+NOT_RECORDABLE = {ATEN.equal, ATEN.lift_fresh, ATEN.masked_select, ATEN.repeat_interleave}
+TAGS = {torch.Tag.nondeterministic_seeded, torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape}
 INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
 
 
@@ -39,7 +37,8 @@ class StandInRecording(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         packet = func.overloadpacket
         masked = packet in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
-        if packet in NOT_RECORDABLE or masked:
+        refused = packet in NOT_RECORDABLE or (packet not in INDEXED and TAGS & set(func.tags))
+        if masked or refused:
             raise RuntimeError(f"{func} cannot be recorded")
         out = func(*args, **(kwargs or {}))
         self.operations.append((func, args, kwargs or {}, out))

@@ -1,11 +1,14 @@
 """Recorded functions, steps and updates give what they give unrecorded; a stand-in records where there is no GPU."""
 
+import copy
+
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 
 from agents.collection import make_collection
 from agents.config import AgentConfig
+from agents.divergence import WATCHED
 from agents.evaluation import evaluate_policy
 from agents.learners import make_learners, make_update
 from agents.networks import acting, make_actor, make_policies
@@ -13,10 +16,12 @@ from agents.noise import noises_of
 from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config
-from envs import SurveillanceConfig, SurveillanceEnv, graphs
+from envs import SurveillanceConfig, SurveillanceEnv, graphs, keys, metrics
+from envs.dynamics import other_indices, own_pairs, pair_indices
 from envs.graphs import MOST, WARM_UP, Graphed
 from safety import SafetyConfig, SafetyFilter
 from tests.standin_recording import StandInRecording
+from tests.test_recorder import counted_batch
 
 CPU = torch.device("cpu")
 
@@ -36,7 +41,7 @@ def test_a_function_is_recorded_once_per_shape(recording):
         total.add_(1)
         return x + y, (x * y).sum()
 
-    fast = Graphed(function)
+    fast = Graphed(function, learns=True)
     for k in range(10):
         x, y = torch.full((3,), float(k)), torch.ones(1)
         added, product = fast(x, y)
@@ -55,20 +60,42 @@ def test_a_function_is_recorded_once_per_shape(recording):
 
 
 def test_there_are_not_more_and_more_recordings(recording):
-    fast = Graphed(lambda x: x + 1)
+    fast = Graphed(lambda x: x + 1, learns=True)
     for size in range(1, MOST + 9):
         for _ in range(WARM_UP + 2):
             assert fast(torch.ones(size)).tolist() == size * [2]
     assert StandInRecording.made == MOST
 
 
-def test_gradients_are_not_recorded(recording):
-    fast = Graphed(lambda x: x * 2)
-    for _ in range(6):
-        x = torch.ones(2, requires_grad=True)
-        fast(x).sum().backward()
-        assert x.grad.tolist() == [2, 2]  # pyright: ignore[reportOptionalMemberAccess]
-    assert not StandInRecording.made
+def test_gradients_flow_whatever_was_recorded_without(recording):
+    weight = torch.ones(2, requires_grad=True)
+    fast = Graphed(lambda x: x * weight)
+    for k in range(2 * WARM_UP):
+        with torch.no_grad():
+            assert not fast(torch.ones(2)).requires_grad
+        weight.grad = None
+        fast(torch.full((2,), float(k))).sum().backward()
+        assert weight.grad.tolist() == [k, k]  # pyright: ignore[reportOptionalMemberAccess]
+    assert StandInRecording.made == 1
+
+
+def test_inference_tensors_are_not_mixed_with_others(recording):
+    fast = Graphed(lambda x: x + 1)
+    for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
+        for _ in range(WARM_UP + 2):
+            with mode():
+                assert fast(torch.ones(2)).tolist() == [2, 2]
+    assert StandInRecording.made == 2
+
+
+def test_what_recordings_know_by_address_is_kept(recording):
+    """The stand-in holds all tensors; a CUDA graph does not."""
+    made = [make(3, CPU) for make in (other_indices, pair_indices, own_pairs, metrics._pairs)]
+    for n in range(4, 90):
+        for make in (other_indices, pair_indices, own_pairs, metrics._pairs):
+            make(n, CPU)
+    again = [make(3, CPU) for make in (other_indices, pair_indices, own_pairs, metrics._pairs)]
+    assert all(old is new for old, new in zip(made, again, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -76,31 +103,52 @@ def test_gradients_are_not_recorded(recording):
     [
         lambda x: x[x > 0],
         lambda x: x * float(x.sum()),
-        lambda x: x + torch.randn(2),
         lambda x: x + torch.tensor([1.0, 2.0]),
+        lambda x: x + torch.randn(2),
+        torch.randn_like,
+        lambda x: x.clone().exponential_(),
+        lambda x: torch.bernoulli(x / 2),
+        lambda x: torch.nn.functional.dropout(x, training=True),
+        lambda x: x.unique(),
+        lambda x: x.long().bincount(),
+        lambda x: (x > 0).nonzero(),
     ],
-    ids=["selects", "reads", "draws", "brings"],
+    ids=[
+        "masks",
+        "reads",
+        "brings",
+        "randn",
+        "like",
+        "exponential",
+        "bernoulli",
+        "dropout",
+        "unique",
+        "counts",
+        "selects",
+    ],
 )
 def test_what_a_graph_cannot_hold_raises(recording, function):
-    fast = Graphed(function)
+    fast = Graphed(function, learns=True)
     for _ in range(WARM_UP):
         fast(torch.ones(2))
     with pytest.raises(RuntimeError, match="cannot be recorded"):
         fast(torch.ones(2))
 
 
-def trained(iterations: int, n_seeds: int = 1, device: torch.device = CPU, **settings) -> dict[str, torch.Tensor]:
-    """Collect and update; everything that comes of it."""
-    config = Config(fixed_sizes=True, cuda_graphs=True, **settings)
+def trained(
+    iterations: int, n_seeds: int = 1, device: torch.device = CPU, *, on: bool = True, **settings
+) -> dict[str, torch.Tensor]:
+    """Collect and update, by graphs if ``on``; everything that comes of it. The optimisers are those of graphs either way."""
+    config = Config(fixed_sizes=True, cuda_graphs=on, **settings)
     config.collector.num_envs = 4
     seeds, world, agent = list(range(n_seeds)), config.env, config.agent
     n_observation = SurveillanceEnv(world).n_observation
     learners, learner = make_learners(n_observation, world, agent, config.safety, device, seeds=seeds, cuda_graphs=True)
-    update = make_update(learner, agent, config.safety, cuda_graphs=True)
+    update = make_update(learner, agent, config.safety, cuda_graphs=on)
     _, explore = make_policies(learner.actor, world, config.safety, agent, seeds, device, **config.computing)
     collection = make_collection(config, seeds, learners, explore, noises_of(explore), device, print)
     buffer, multi_step = make_buffer(1000, device, 0), MultiStep(agent.n_steps, agent.gamma)
-    recorder = TrainingRecorder(world, 4 * n_seeds, device, cuda_graphs=True)
+    recorder = TrainingRecorder(world, 4 * n_seeds, device, cuda_graphs=on)
     found: dict[str, torch.Tensor] = {}
     for k, batch in enumerate(collection.batches(4 * n_seeds * iterations, resumed=False)):
         recorder.update(batch)
@@ -132,36 +180,101 @@ def trained(iterations: int, n_seeds: int = 1, device: torch.device = CPU, **set
     ],
     ids=["default", "seeds", "own networks", "space", "moving", "half", "in loss", "paper", "none", "dalal"],
 )
-def test_training_is_the_same(recording, settings, recordings, monkeypatch):
+def test_training_is_the_same(recording, settings, recordings):
     found = trained(16, **settings)
     assert StandInRecording.made == recordings  # actor, filter, step, counting and update
     assert StandInRecording.replays >= 6 * recordings
-    monkeypatch.setattr(graphs, "recorder_for", lambda tensor: None)
-    expected = trained(16, **settings)
+    expected = trained(16, on=False, **settings)
     assert not [name for name, value in expected.items() if not torch.equal(found[name], value)]
 
 
 @pytest.mark.parametrize("restart", [False, True])
 @pytest.mark.parametrize("mode", ["certified", "none"])
-def test_evaluation_is_the_same(recording, restart, mode, monkeypatch):
+def test_evaluation_is_the_same(recording, restart, mode):
     world, safety = SurveillanceConfig(density="moving"), SafetyConfig(mode=mode)
     actor = make_actor(SurveillanceEnv(world).n_observation, world, AgentConfig())
 
-    def evaluated() -> tuple:
-        sizes = {"fixed_sizes": True, "cuda_graphs": True}
+    def evaluated(*, on: bool) -> tuple:
+        sizes = {"fixed_sizes": True, "cuda_graphs": on}
         env = SurveillanceEnv(world, 6, seed=2, **sizes)
-        policy = TensorDictSequential(acting(actor, cuda_graphs=True), SafetyFilter(safety, world, **sizes))
+        policy = TensorDictSequential(acting(actor, cuda_graphs=on), SafetyFilter(safety, world, **sizes))
         found = [evaluate_policy(env, policy, 60, record=True, restart=restart) for _ in range(2)]
         return [metrics | statistics for metrics, statistics, _ in found], found[1][2].position
 
     with torch.no_grad():
-        found, positions = evaluated()
+        found, positions = evaluated(on=True)
         assert StandInRecording.made == 3  # actor, filter and step
-        monkeypatch.setattr(graphs, "recorder_for", lambda tensor: None)
-        expected, expected_positions = evaluated()
+        expected, expected_positions = evaluated(on=False)
     assert found == expected
     assert (positions == expected_positions).all()
     assert sum(expected[0]["violations"].values()) > 0 or mode == "certified"
+
+
+@pytest.mark.parametrize("seeds", [[0], [0, 1]], ids=["one", "two"])
+@pytest.mark.parametrize("first", [False, True])
+def test_optimisers_go_on_from_checkpoints_of_the_other_kind(seeds, first):
+    config = Config(agent=AgentConfig(n_steps=1))
+    world, agent, safety = config.env, config.agent, config.safety
+    n_observation = SurveillanceEnv(world).n_observation
+    rows = next(iter(make_rows(world, 8)))
+    batch = rows if len(seeds) == 1 else torch.stack([rows] * len(seeds))
+
+    def made(*, on: bool):
+        parts, whole = make_learners(n_observation, world, agent, safety, CPU, seeds=seeds, cuda_graphs=on)
+        return parts, whole, make_update(whole, agent, safety)
+
+    parts, whole, update = made(on=first)
+    for _ in range(4):
+        update(batch)
+    whole.share_moments()
+    saved = [copy.deepcopy({"loss": part.loss.state_dict(), **states(part)}) for part in parts]
+    for _ in range(3):
+        update(batch)
+    others, other, go_on = made(on=not first)
+    for part, content in zip(others, saved, strict=True):
+        part.loss.load_state_dict(content["loss"])
+        for name, optimizer in part.optimizers.items():
+            optimizer.load_state_dict(content[name])
+            assert bool(optimizer.param_groups[0]["fused"]) != first
+    other.gather_moments()
+    for _ in range(3):
+        go_on(batch)
+    for mine, theirs in zip(whole.loss.parameters(), other.loss.parameters(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-6)
+
+
+def make_rows(world: SurveillanceConfig, count: int):
+    """Transitions ``(count,)`` of an untrained policy."""
+    config = Config(env=world, agent=AgentConfig(n_steps=1))
+    config.collector.num_envs = count
+    learners, learner = make_learners(
+        SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=[0]
+    )
+    _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU)
+    collection = make_collection(config, [0], learners, explore, noises_of(explore), CPU, print)
+    yield to_transitions(next(collection.batches(count, resumed=False))).reshape(-1).clone()
+
+
+def states(learner) -> dict:
+    """Of its optimisers, by name."""
+    return {name: optimizer.state_dict() for name, optimizer in learner.optimizers.items()}
+
+
+def test_a_recorded_count_tells_what_is_to_be_looked_at(recording):
+    recorder = TrainingRecorder(SurveillanceConfig(n_agents=2), 1, None, cuda_graphs=True)
+    for _ in range(WARM_UP + 2):
+        assert not recorder.update(counted_batch())
+    assert StandInRecording.made == 1
+    for key in [keys.OUTSIDE, *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS)]:
+        batch = counted_batch()
+        batch[key][0, 1, 0] = True
+        assert recorder.update(batch), key
+    for key in WATCHED.values():
+        batch = counted_batch()
+        batch[key][0, 0, 1] = float("nan")
+        assert recorder.update(batch), key
+    assert not recorder.update(counted_batch())
+    assert recorder.violations == dict.fromkeys(keys.VIOLATION_KINDS, 1)
 
 
 def test_graphs_need_fixed_sizes():

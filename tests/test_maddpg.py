@@ -6,6 +6,7 @@ import itertools
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from agents import AgentConfig
@@ -575,3 +576,19 @@ def test_buffer_samples_by_its_own_seed():
         samples.append(buffer.sample(16)["x"])
     assert torch.equal(samples[0], samples[1])
     assert not torch.equal(samples[0], samples[2])
+
+
+@pytest.mark.parametrize("capacity", [7, 10, 64])
+def test_rows_written_as_slices_lie_where_torchrl_puts_them(capacity):
+    generator = torch.Generator().manual_seed(0)
+    mine, theirs = (
+        make_buffer(capacity, torch.device("cpu"), 0),
+        TensorDictReplayBuffer(storage=LazyTensorStorage(capacity)),
+    )
+    for _ in range(30):
+        count = int(torch.randint(1, 8, (), generator=generator))
+        rows = TensorDict({"a": torch.randn(count, 2, generator=generator)}, [count])
+        assert torch.equal(mine.extend(rows.clone()), theirs.extend(rows.clone()))
+        assert len(mine) == len(theirs)
+        assert mine.writer.state_dict() == theirs.writer.state_dict()
+        assert (mine.storage.get(slice(0, len(mine))) == theirs.storage.get(slice(0, len(mine)))).all()
