@@ -1,8 +1,8 @@
 """python tests/benchmarks/bench_gpu.py [--batches 512,4096] [--compiled 4096] [--robots 3] [--device cuda]
 
-A certified step and the filter alone on a GPU: selecting what needs work, at fixed sizes, and at fixed sizes as one compiled graph
-(for the batches of ``--compiled``; most of a minute each). Medians of three rounds, the device waited for at the end of each;
-"first" is what the first four steps take, compilation included.
+A certified step and the filter alone on a GPU: selecting what needs work, at fixed sizes, by CUDA graphs, and compiled without
+graphs (for the batches of ``--compiled``; most of a minute each). Medians of three rounds, the device waited for at the end of
+each; "first" is what the first five steps take, compilation and recording included.
 """
 
 import statistics
@@ -14,7 +14,7 @@ import torch
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
-ROUNDS, WARM_UP = 3, 4
+ROUNDS, WARM_UP = 3, 5
 
 
 def median_ms(run: Callable[[int], object], repeats: int, device: str) -> float:
@@ -29,11 +29,12 @@ def median_ms(run: Callable[[int], object], repeats: int, device: str) -> float:
 
 
 @torch.no_grad()
-def measure(batch: int, n: int, device: str, repeats: int, *, fixed_sizes: bool, compiled: bool) -> list:
+def measure(batch: int, n: int, device: str, repeats: int, name: str) -> list:
     """A row of the table."""
+    compiled, sizes = "compiled" in name, {"fixed_sizes": name != "selecting", "cuda_graphs": "graphs" in name}
     world = SurveillanceConfig(n_agents=n, on_violation="continue")  # the host need not ask whether a world is done
-    env = SurveillanceEnv(world, batch, device, seed=1, fixed_sizes=fixed_sizes, compile_functions=compiled)
-    policy = SafetyFilter(SafetyConfig(), world, fixed_sizes=fixed_sizes, compile=compiled)
+    env = SurveillanceEnv(world, batch, device, seed=1, compile_functions=compiled, **sizes)
+    policy = SafetyFilter(SafetyConfig(), world, compile=compiled, **sizes)
     state = [env.reset()]
     actions = [world.max_speed * torch.randn(batch, n, 2, device=device) for _ in range(4)]
 
@@ -47,7 +48,6 @@ def measure(batch: int, n: int, device: str, repeats: int, *, fixed_sizes: bool,
     whole = median_ms(step, repeats, device)
     td = state[0].clone()
     alone = median_ms(lambda k: policy(td.set(keys.NOMINAL_ACTION, actions[k % 4])), repeats, device)
-    name = "fixed sizes, compiled" if compiled else "fixed sizes" if fixed_sizes else "selecting"
     return [batch, n, name, whole, 1e3 * batch / whole, alone, first]
 
 
@@ -55,9 +55,9 @@ def rows(options) -> Iterator[list]:
     """All rows."""
     for n in options.robots:
         for batch in options.batches:
-            kinds = [(False, False), (True, False), *([(True, True)] if batch in options.compiled else [])]
-            for fixed_sizes, compiled in kinds:
-                yield measure(batch, n, options.device, options.repeats, fixed_sizes=fixed_sizes, compiled=compiled)
+            kinds = ("selecting", "fixed sizes", "fixed sizes, graphs", "fixed sizes, compiled")
+            for name in kinds if batch in options.compiled else kinds[:-1]:
+                yield measure(batch, n, options.device, options.repeats, name)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
