@@ -8,8 +8,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import evaluate
 import train
-from envs import SurveillanceConfig
+from agents.incident import load_incident
+from agents.run import TrainingRun
+from envs import SurveillanceConfig, graphs
 from envs.inequalities import derived_quantities
+from tests.standin_recording import StandInRecording
 
 TINY = (
     *("collector.num_envs=4", "collector.steps_per_batch=2", "collector.total_frames=64", "buffer.batch_size=8"),
@@ -212,3 +215,20 @@ def test_a_bad_job_of_a_multirun_leaves_the_others_alone(program, tmp_path):
     assert code == 1
     assert "env.n_agents=0" in output
     assert len(list(tmp_path.glob("runs/*/*/summary.json"))) == 1
+
+
+@pytest.mark.parametrize("sizes", [(), ("fixed_sizes=true", "cuda_graphs=true")], ids=["", "graphs"])
+def test_training_stops_at_a_broken_promise(program, tmp_path, monkeypatch, sizes):
+    """A shield that lets everybody meet in the middle. Evaluations, which would find it first, are left out."""
+
+    def broken(_, position, energy, home, action, current, level, *rest, **options):
+        return -0.19 * position / position.norm(dim=-1, keepdim=True).clamp_min(0.1), level, None
+
+    monkeypatch.setattr("safety.filter.shield", broken)
+    monkeypatch.setattr(TrainingRun, "evaluate", lambda self: None)
+    monkeypatch.setattr(graphs, "recorder_for", lambda tensor: StandInRecording)
+    code, output = program(train.main, *TINY, *sizes, "collector.total_frames=4000")
+    assert code == 1
+    assert "behind the certified filter, which must not happen" in " ".join(output.split())
+    (dump,) = tmp_path.glob("runs/**/violation.json")
+    assert load_incident(dump).safety.mode == "certified"
