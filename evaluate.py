@@ -55,7 +55,7 @@ def main(cfg: DictConfig) -> None:
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
     sizes = {"fixed_sizes": config.fixed_sizes, "cuda_graphs": config.cuda_graphs}
-    env = SurveillanceEnv(*(world, config.num_envs, device), seed=env_seed, compile_functions=config.compile, **sizes)
+    env = SurveillanceEnv(world, config.num_envs, device, env_seed, compile_functions=config.compile, **sizes)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)

@@ -176,7 +176,7 @@ class MultiStep:
 
     def __init__(self, n_steps: int, gamma: float, n_blocks: int = 1) -> None:
         self.n_steps, self.gamma = n_steps, gamma
-        self.waiting: dict[NestedKey, Tensor] = {}
+        self.waiting: dict[tuple[str, ...], Tensor] = {}
         """By key, ``(num_envs, <= n_steps - 1, ...)``: of all blocks, one after the other."""
         self.blocks = [WaitingSteps(self, k) for k in range(n_blocks)]
 
@@ -185,12 +185,12 @@ class MultiStep:
         if self.n_steps == 1:
             return transitions.reshape(-1)
         if restored := [block.restored for block in self.blocks if block.restored is not None]:
-            self.waiting = leaves(cast(TensorDictBase, torch.cat(restored)).to(transitions.device))  # pyright: ignore[reportArgumentType]
+            self.waiting = flat(cast(TensorDictBase, torch.cat(restored)).to(transitions.device))  # pyright: ignore[reportArgumentType]
             for block in self.blocks:
                 block.restored = None
         window = {  # tensors of its own: the collector writes into the batch
             key: torch.cat([self.waiting[key], new], dim=1) if self.waiting else new.clone()
-            for key, new in leaves(transitions).items()
+            for key, new in flat(transitions).items()
         }
         reward, done = window["next", *keys.REWARD], window["next", "done"].squeeze(-1)
         worlds, steps = done.shape
@@ -212,13 +212,14 @@ class MultiStep:
             for key, rows in window.items()
         }
         taken = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
-        found |= {("next", *keys.REWARD): total.flatten(0, 1), STEPS: taken.flatten(0, 1)}
+        found |= {("next", *keys.REWARD): total.flatten(0, 1), (STEPS,): taken.flatten(0, 1)}
         return TensorDict(found, [worlds * length], transitions.device)
 
 
-def leaves(rows: TensorDictBase) -> dict[NestedKey, Tensor]:
-    """Tensors of a tensordict by key, nested keys as tuples."""
-    return dict(rows.items(include_nested=True, leaves_only=True))
+def flat(rows: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
+    """The tensors of a tensordict by tuple of names."""
+    items = rows.items(include_nested=True, leaves_only=True)
+    return {(name,) if isinstance(name, str) else name: value for name, value in items}
 
 
 class WaitingSteps:

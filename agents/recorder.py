@@ -121,6 +121,7 @@ class TrainingRecorder:
     def __init__(self, world: SurveillanceConfig, num_envs: int, device, *, cuda_graphs: bool = False) -> None:
         self.world = world
         self._count = Graphed(self._count_tensors) if cuda_graphs else None
+        self._keys: list[NestedKey] = []
         self.frames = 0
         self.violations = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.episodes = EpisodeTracker(num_envs, device)
@@ -152,7 +153,7 @@ class TrainingRecorder:
         if self._count is None:
             counted, violating = self._counts(batch)
         else:
-            self._keys = [key for key in COUNTED if key in batch.keys(True)]
+            self._keys = self._keys or [key for key in COUNTED if key in batch.keys(True)]
             counted, violating = self._count(*(batch[key] for key in self._keys))
         found = dict(zip(self._names, counted.tolist(), strict=True))
         for kind in keys.VIOLATION_KINDS:

@@ -19,7 +19,7 @@ from torchrl.collectors import Collector
 from agents.config import AgentConfig
 from agents.networks import make_actor, make_policies
 from agents.noise import noises_of
-from agents.pipeline import COLLECTOR_OPTIONS, use_threads
+from agents.pipeline import COLLECTOR_OPTIONS, flat, use_threads
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig
 
@@ -119,12 +119,6 @@ def weights_of(actor: TensorDictModuleBase) -> Weights:
 def copied(weights: Weights) -> Weights:
     """Copies on the CPU, which later updates leave alone."""
     return {name: value.to("cpu", copy=True) for name, value in weights.items()}
-
-
-def flat(rows: TensorDictBase) -> Weights:
-    """The tensors of a tensordict by tuple of names."""
-    items = rows.items(include_nested=True, leaves_only=True)
-    return {(name,) if isinstance(name, str) else name: value for name, value in items}
 
 
 def unflat(shape: Sequence[int], tensors: Weights) -> TensorDict:

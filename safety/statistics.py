@@ -51,15 +51,11 @@ class FilterStatistics:
             tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``.
             alive: ``(*B, 1)`` bool, worlds that count; all if not given.
         """
-        self.add(self.measure(tensordict, alive))
-
-    def measure(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, float]:
-        """What :meth:`add` takes of filter outputs, as :meth:`update`'s; waits for the device once."""
         found = self.numbers(tensordict, alive)
-        return dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True))
+        self.add(dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True)))
 
     def numbers(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, Tensor]:
-        """What :meth:`measure` reads, each ``()`` float64."""
+        """What :meth:`add` takes, of :meth:`update`'s arguments, each ``()`` float64: the device is not waited for."""
         status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
         correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
         counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
@@ -82,7 +78,7 @@ class FilterStatistics:
         return found
 
     def add(self, found: dict[str, float]) -> None:
-        """Add what :meth:`measure` found."""
+        """Add what was read of :meth:`numbers`."""
         for name in self.sums:
             self.sums[name] += found[name]
         self.max_residual = max(self.max_residual, found["max_residual"])

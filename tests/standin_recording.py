@@ -15,6 +15,11 @@ TAGS = {torch.Tag.nondeterministic_seeded, torch.Tag.data_dependent_output, torc
 INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
 
 
+def by_mask(func, args) -> bool:
+    """Whether an operation selects by a mask: its size depends on the data."""
+    return func.overloadpacket in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
+
+
 class StandInRecording(TorchDispatchMode):
     """As :class:`envs.graphs.CudaRecording`, on any device.
 
@@ -36,9 +41,8 @@ class StandInRecording(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         packet = func.overloadpacket
-        masked = packet in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
         refused = packet in NOT_RECORDABLE or (packet not in INDEXED and TAGS & set(func.tags))
-        if masked or refused:
+        if refused or by_mask(func, args):
             raise RuntimeError(f"{func} cannot be recorded")
         out = func(*args, **(kwargs or {}))
         self.operations.append((func, args, kwargs or {}, out))

@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from agents.collection import make_collection
@@ -216,7 +217,7 @@ def test_optimisers_go_on_from_checkpoints_of_the_other_kind(seeds, first):
     config = Config(agent=AgentConfig(n_steps=1))
     world, agent, safety = config.env, config.agent, config.safety
     n_observation = SurveillanceEnv(world).n_observation
-    rows = next(iter(make_rows(world, 8)))
+    rows = make_rows(world, 8)
     batch = rows if len(seeds) == 1 else torch.stack([rows] * len(seeds))
 
     def made(*, on: bool):
@@ -243,7 +244,7 @@ def test_optimisers_go_on_from_checkpoints_of_the_other_kind(seeds, first):
         torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-6)
 
 
-def make_rows(world: SurveillanceConfig, count: int):
+def make_rows(world: SurveillanceConfig, count: int) -> TensorDictBase:
     """Transitions ``(count,)`` of an untrained policy."""
     config = Config(env=world, agent=AgentConfig(n_steps=1))
     config.collector.num_envs = count
@@ -252,7 +253,7 @@ def make_rows(world: SurveillanceConfig, count: int):
     )
     _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU)
     collection = make_collection(config, [0], learners, explore, noises_of(explore), CPU, print)
-    yield to_transitions(next(collection.batches(count, resumed=False))).reshape(-1).clone()
+    return to_transitions(next(collection.batches(count, resumed=False))).reshape(-1).clone()
 
 
 def states(learner) -> dict:

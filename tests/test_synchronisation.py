@@ -20,11 +20,11 @@ from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
 from agents.recorder import TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv
+from tests.standin_recording import by_mask
 
 CPU = torch.device("cpu")
 ATEN = torch.ops.aten
 WAITS = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal, ATEN.repeat_interleave, ATEN._unique2}
-INDEXED = {ATEN.index, ATEN.index_put, ATEN.index_put_, ATEN._index_put_impl_}
 MOST = {"collect": 18, "count": 1, "store": 0, "update": 0}
 """Waits of an iteration without resets. Of collecting, two are TorchRL's (is any world done?), the others select the worlds,
 pairs and rows that the filter and the reassignment of slots have to look at."""
@@ -41,8 +41,7 @@ class Waits(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         packet = func.overloadpacket
-        masked = packet in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
-        if (packet in WAITS or masked) and id(args[0]) not in self.on_host:
+        if (packet in WAITS or by_mask(func, args)) and id(args[0]) not in self.on_host:
             self.found[str(packet)] += 1
         return func(*args, **(kwargs or {}))
 
