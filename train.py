@@ -22,7 +22,7 @@ from agents.learners import make_learners, make_update
 from agents.networks import acting, make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
-from agents.recorder import Seconds
+from agents.recorder import BatchCounter, Seconds
 from agents.run import (
     FAILURES,
     SeedsFailedError,
@@ -89,7 +89,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
-    adversary = config.adversary_reward()
+    counter, adversary = BatchCounter(world, len(folders), **graphs), config.adversary_reward()
     seconds.watch("policy", explore_policy)
     seconds.watch("filter", safety_filter)
     origin, settings = run_origin(cfg, device), hashed_config(cfg)
@@ -129,7 +129,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
         for batch in batches:
             transitions = to_transitions(batch, config.train.violation_penalty, adversary)
             parts = (batch, multi_step(transitions), transitions["next"][keys.REWARD])
-            for_each(runs, TrainingRun.take, *(shares(part, runs) for part in parts))
+            for_each(runs, TrainingRun.take, counter(batch), *(shares(part, runs) for part in parts))
             seconds.spent("collect")
             if any(run.learns for run in runs):
                 for minibatch in minibatches(runs, config.train.n_updates):

@@ -30,7 +30,8 @@ class Board:
     """
 
     def __init__(self, folder: Path, frames: int, config: Mapping[str, Any], *, figures: bool, gif: bool) -> None:
-        self.writer = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
+        # the queue holds a point of all curves: at TensorBoard's ten places the run waits for the disk
+        self.writer = SummaryWriter(str(folder), max_queue=1000, purge_step=frames + 1 if frames else None)
         self.figures, self.gif = figures, gif
         if not frames:
             self._hyperparameters(config)

@@ -1,5 +1,7 @@
 """Exploration noise on nominal actions, before the filter: of one learner, or of several, each on its block of the worlds."""
 
+import functools
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -45,31 +47,15 @@ class ExplorationNoise(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add noise to ("agents", "nominal_action") in place of it."""
-        action, step = tensordict[keys.NOMINAL_ACTION], tensordict[keys.STEP_COUNT]
-        return tensordict.set(keys.NOMINAL_ACTION, self.explore(action, step))
-
-    def explore(self, action: Tensor, step: Tensor) -> Tensor:
-        """``(B, N, d)`` nominal actions and ``(B, 1)`` steps since the episodes began; returns the noisy actions."""
-        noise = torch.randn(action.shape, generator=self.generator, dtype=action.dtype, device=action.device)
-        if self.agent.noise == "ou":
-            keep = 1 - self.agent.ou_theta
-            noise = noise * (1 - keep**2) ** 0.5
-            if self.process is not None and self.process.shape == action.shape:
-                noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, self.process)
-            self.process = noise
-        size = self.sigma * self.max_speed * self.spread(action)
-        self.frames += step.numel()
-        return action + size * noise
-
-    def spread(self, action: Tensor) -> Tensor:
-        """Share of sigma for each world, evenly over ``[1 - noise_spread, 1]``, ``(*B, 1, 1)``."""
-        worlds = action.shape[0]
-        rank = torch.arange(1, worlds + 1, dtype=action.dtype, device=action.device) / worlds
-        return (1 - self.agent.noise_spread * (1 - rank)).reshape(-1, *[1] * (action.dim() - 1))
+        return explore([self], tensordict)
 
     def get_extra_state(self) -> dict:
         """Generator, annealing and process, for checkpoints."""
-        return {"generator": self.generator.get_state(), "frames": self.frames, "process": self.process}
+        return {
+            "generator": self.generator.get_state(),
+            "frames": self.frames,
+            "process": None if self.process is None else self.process.clone(),
+        }
 
     def set_extra_state(self, state: dict) -> None:
         """Restore what :meth:`get_extra_state` returned."""
@@ -97,6 +83,42 @@ class NoiseOfSeeds(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add noise to ("agents", "nominal_action") in place of it."""
-        blocks = [tensordict[key].chunk(len(self.parts)) for key in (keys.NOMINAL_ACTION, keys.STEP_COUNT)]
-        noisy = [noise.explore(*block) for noise, *block in zip(self.parts, *blocks, strict=True)]
-        return tensordict.set(keys.NOMINAL_ACTION, torch.cat(noisy))
+        return explore(list(self.parts), tensordict)
+
+
+def explore(parts: list[ExplorationNoise], tensordict: TensorDictBase) -> TensorDictBase:
+    """Add the noise of learners, who have all seen as many frames, to the nominal actions of their blocks of the worlds.
+
+    Args:
+        parts: the noise of each.
+        tensordict: nominal actions ``(B, N, d)`` and steps since the episodes began ``(B, 1)``.
+    """
+    first, action, step = parts[0], tensordict[keys.NOMINAL_ACTION], tensordict[keys.STEP_COUNT]
+    if any(part.frames != first.frames for part in parts):
+        raise ValueError(f"the learners' noise has seen {[part.frames for part in parts]} frames: they go on together.")
+    noise = torch.empty_like(action, memory_format=torch.contiguous_format)
+    for part, block in zip(parts, noise.chunk(len(parts)), strict=True):
+        torch.randn(block.shape, generator=part.generator, out=block)
+    if first.agent.noise == "ou":
+        keep = 1 - first.agent.ou_theta
+        noise = noise * (1 - keep**2) ** 0.5
+        before = [part.process for part in parts if part.process is not None]
+        if sum(len(block) for block in before) == len(noise):
+            before = before[0] if len(before) == 1 else torch.cat(before)
+            noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, before)
+        for part, block in zip(parts, noise.chunk(len(parts)), strict=True):
+            part.process = block
+    spread = spread_of_worlds(
+        len(action) // len(parts), len(parts), first.agent.noise_spread, action.dtype, action.device
+    )
+    size = first.sigma * first.max_speed * spread
+    for part in parts:
+        part.frames += step.numel() // len(parts)
+    return tensordict.set(keys.NOMINAL_ACTION, action + size * noise)
+
+
+@functools.lru_cache(maxsize=16)
+def spread_of_worlds(worlds: int, copies: int, noise_spread: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Share of sigma for each world, evenly over ``[1 - noise_spread, 1]``, of so many blocks, ``(copies * worlds, 1, 1)``."""
+    rank = torch.arange(1, worlds + 1, dtype=dtype, device=device) / worlds
+    return (1 - noise_spread * (1 - rank)).repeat(copies).reshape(-1, 1, 1)

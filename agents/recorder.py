@@ -2,6 +2,7 @@
 
 import math
 import time
+from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from agents.divergence import WATCHED
 from envs import SurveillanceConfig, keys
-from envs.graphs import Graphed
+from envs.graphs import graphed
 from envs.metrics import EpisodeTracker
 from safety.statistics import MARGINS, FilterStatistics
 
@@ -18,7 +19,7 @@ COUNTED: list[NestedKey] = [
     *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),
     *(("next", keys.COVERAGE_COST), ("next", "done")),
 ]
-"""What :meth:`TrainingRecorder.update` reads of a batch."""
+"""What :class:`BatchCounter` reads of a batch."""
 
 
 class Every:
@@ -108,20 +109,72 @@ class Seconds:
         self.inside = {name: state["inside"].get(name, 0.0) for name in self.inside}
 
 
+class Counted(NamedTuple):
+    """What :class:`BatchCounter` found in the batch of one learner."""
+
+    sums: dict[str, float]
+    """Violations by kind, "cost", "done" and "finite" (1 or 0), and what :meth:`FilterStatistics.add` takes."""
+    violating: Tensor
+    """Violating robots of each step, ``(num_envs, T)``."""
+
+
+class BatchCounter:
+    """Sums over collected batches; waits for the device once a batch, however many learners there are.
+
+    Args:
+        world: the world.
+        n_learners: learners, each with its block of the batch's worlds.
+        cuda_graphs: record the counting and replay it (:mod:`envs.graphs`).
+    """
+
+    def __init__(self, world: SurveillanceConfig, n_learners: int = 1, *, cuda_graphs: bool = False) -> None:
+        self.filter = FilterStatistics(world.max_speed)
+        self.n_learners = n_learners
+        self._count = graphed(self._count_tensors, enabled=cuda_graphs)
+        self._keys: list[NestedKey] = []
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> list[Counted]:
+        """``(n_learners * num_envs, T)``: what each learner's worlds hold."""
+        self._keys = self._keys or [key for key in COUNTED if key in batch.keys(True)]
+        sums, violating = self._count(*(batch[key] for key in self._keys))
+        found = (dict(zip(self._names, row, strict=True)) for row in sums.tolist())
+        return [Counted(*own) for own in zip(found, violating.chunk(self.n_learners), strict=True)]
+
+    def _count_tensors(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        """Of tensors ``(n_learners * num_envs, T, ...)`` in the order of ``_keys``: ``(n_learners, sums)``, violating."""
+        blocks = zip(*(tensor.chunk(self.n_learners) for tensor in tensors), strict=True)
+        parts = [TensorDict(dict(zip(self._keys, block, strict=True)), block[0].shape[:2]) for block in blocks]
+        sums, violating = zip(*(self._sums(part) for part in parts), strict=True)
+        return torch.stack(sums), torch.cat(violating)
+
+    def _sums(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Sums over a learner's batch, float64, in the order of ``_names``, and the violating robots of each step."""
+        following = batch["next"]
+        flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
+        found = dict(zip(keys.VIOLATION_KINDS, (flag.sum().double() for flag in flags), strict=True))
+        found["cost"] = following[keys.COVERAGE_COST].sum().double()
+        found["done"] = following["done"].any().double()
+        # finite only if all terms are; an overflow is looked at more closely
+        found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
+        found |= self.filter.numbers(batch)
+        self._names = list(found)
+        return torch.stack(list(found.values())), torch.stack(flags).any(dim=0).sum(
+            -1
+        )  # a robot may violate twice at once
+
+
 class TrainingRecorder:
-    """Counts every collected transition once.
+    """Takes in every collected transition once.
 
     Args:
         world: the world.
         num_envs: number of worlds.
         device: where the per-world sums live.
-        cuda_graphs: record the counting and replay it (:mod:`envs.graphs`).
     """
 
-    def __init__(self, world: SurveillanceConfig, num_envs: int, device, *, cuda_graphs: bool = False) -> None:
+    def __init__(self, world: SurveillanceConfig, num_envs: int, device: torch.device | None) -> None:
         self.world = world
-        self._count = Graphed(self._count_tensors) if cuda_graphs else None
-        self._keys: list[NestedKey] = []
         self.frames = 0
         self.violations = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.episodes = EpisodeTracker(num_envs, device)
@@ -142,48 +195,29 @@ class TrainingRecorder:
         self.best_cost = cost
         return True
 
-    @torch.no_grad()
-    def update(self, batch: TensorDictBase) -> bool:
-        """Take in a collected batch ``(num_envs, T)``; waits for the device once (and where episodes end).
+    def update(self, batch: TensorDictBase, counted: Counted) -> bool:
+        """Take in a collected batch; waits for the device where episodes end.
+
+        Args:
+            batch: ``(num_envs, T)``.
+            counted: what was found in it.
 
         Returns:
             Whether there is something in it that ought not to be: a violation, a state outside the filter's set, or a number
             that may not be finite.
         """
-        if self._count is None:
-            counted, violating = self._counts(batch)
-        else:
-            self._keys = self._keys or [key for key in COUNTED if key in batch.keys(True)]
-            counted, violating = self._count(*(batch[key] for key in self._keys))
-        found = dict(zip(self._names, counted.tolist(), strict=True))
+        found = counted.sums
         for kind in keys.VIOLATION_KINDS:
             self.violations[kind] += int(found[kind])
             self._violations_recent[kind] += int(found[kind])
         reward, done = batch["next", *keys.REWARD][..., 0, 0], batch["next", "done"].squeeze(-1)
-        self.episodes.update(reward, violating, done, any_done=found["done"] > 0)
+        self.episodes.update(reward, counted.violating, done, any_done=found["done"] > 0)
         self.filter.add(found)
         self._recent.add(found)
         self._cost[0] += found["cost"]
         self._cost[1] += batch.numel()
         self.frames += batch.numel()
         return any(found[kind] > 0 for kind in (*keys.VIOLATION_KINDS, "outside")) or not found["finite"]
-
-    def _counts(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Sums over a batch, float64, in the order of ``_names``, and the violating robots of each step ``(num_envs, T)``."""
-        following = batch["next"]
-        flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
-        found = dict(zip(keys.VIOLATION_KINDS, (flag.sum().double() for flag in flags), strict=True))
-        found["cost"] = following[keys.COVERAGE_COST].sum().double()
-        found["done"] = following["done"].any().double()
-        # finite only if all terms are; an overflow is looked at more closely
-        found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
-        found |= self.filter.numbers(batch)
-        self._names = list(found)
-        violating = torch.stack(flags).any(dim=0).sum(-1)  # a robot may violate twice at once
-        return torch.stack(list(found.values())), violating
-
-    def _count_tensors(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        return self._counts(TensorDict(dict(zip(self._keys, tensors, strict=True)), tensors[0].shape[:2]))
 
     def scalars(self) -> dict[str, float]:
         """Numbers since the last call, by TensorBoard tag; starts a new interval."""

@@ -20,8 +20,8 @@ from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
 from agents.noise import ExplorationNoise
-from agents.pipeline import WaitingSteps, draw, make_buffer
-from agents.recorder import Every, Seconds, TrainingRecorder
+from agents.pipeline import WaitingSteps, draw, make_buffer, store
+from agents.recorder import Counted, Every, Seconds, TrainingRecorder
 from agents.training_config import Config
 from agents.training_state import TrainingState, valid_ages
 from envs import SurveillanceEnv, keys
@@ -94,7 +94,7 @@ class TrainingRun:
         device, agent = eval_env.device, config.agent
         self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
         self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
-        self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device, cuda_graphs=config.cuda_graphs)
+        self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),
             "evaluate": Every(config.eval.interval_frames),
@@ -148,10 +148,11 @@ class TrainingRun:
         if self.recorder.evaluated(metrics | {"filter": statistics}):
             self.state.save_best()
 
-    def take(self, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
-        """Count a collected batch, check it and store its transitions.
+    def take(self, counted: Counted, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
+        """Take in a collected batch: check it and store its transitions.
 
         Args:
+            counted: what was found in it.
             batch: ``(num_envs, T)``.
             steps: ``(M,)``, what :class:`agents.pipeline.MultiStep` made of it.
             rewards: ``(num_envs, T, N, 1)``, those of the objective.
@@ -160,11 +161,11 @@ class TrainingRun:
             DivergedError: if an observation, action or reward is not finite.
             ViolationError: at a violation behind the certified filter.
         """
-        if self.recorder.update(batch):
+        if self.recorder.update(batch, counted):
             self.check(batch)
             check_batch(batch, self.recorder.frames)
         if len(steps):
-            self.buffer.extend(steps)
+            store(self.buffer, steps)
         self.batch, self.rewards = batch, rewards
 
     @property

@@ -19,8 +19,8 @@ from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies
 from agents.noise import ExplorationNoise
-from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
-from agents.recorder import TrainingRecorder
+from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.recorder import BatchCounter, TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.blocks import WorldBlock
@@ -161,7 +161,7 @@ def test_steps_replay_and_updates(name, noise):
     for part in batch.split(2, dim=1):
         steps = multi_step(to_transitions(part, violation_penalty=1.0))
         if len(steps):
-            buffer.extend(steps)
+            store(buffer, steps)
     assert len(buffer) == 4 * (8 - config.agent.n_steps + 1)
     rows = draw(buffer, 64, learner.loss.reads)
     assert on_the_stand_in(rows)
@@ -200,10 +200,10 @@ def test_filters(safety):
 def test_counting_and_checking_a_batch(name, tmp_path):
     world = world_of(name)
     batch, _ = roll_out(world, Config(env=world), 3)
-    recorder = TrainingRecorder(world, 4, META)
+    counter, recorder = BatchCounter(world), TrainingRecorder(world, 4, META)
     for step in batch.split(1, dim=1):
         with ReadsZeros(truth=False) as reads:
-            recorder.update(step)
+            recorder.update(step, *counter(step))
             check_violations(step, world=world, safety=SafetyConfig(), folder=tmp_path)
         assert reads.count == 2
         with ReadsZeros(truth=True):
@@ -268,7 +268,8 @@ def test_noise_of_a_checkpoint_goes_on_where_the_generator_is():
     world = world_of("default")
     noise = ExplorationNoise(AgentConfig(noise="ou"), world, 0, META)
     action, step = torch.empty(4, 3, 2, device=META), torch.zeros(4, 1, dtype=torch.int64, device=META)
-    assert noise.explore(action, step).device == META
+    td = TensorDict({keys.NOMINAL_ACTION: action, keys.STEP_COUNT: step}, [4])
+    assert noise(td)[keys.NOMINAL_ACTION].device == META
     again = ExplorationNoise(AgentConfig(noise="ou"), world, 1, META)
     again.set_extra_state(noise.get_extra_state())
-    assert again.explore(action, step).device == META
+    assert again(td)[keys.NOMINAL_ACTION].device == META

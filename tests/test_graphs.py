@@ -14,15 +14,15 @@ from agents.evaluation import evaluate_policy
 from agents.learners import make_learners, make_update
 from agents.networks import acting, make_actor, make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
-from agents.recorder import TrainingRecorder
+from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.recorder import BatchCounter, TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, graphs, keys, metrics
 from envs.dynamics import other_indices, own_pairs, pair_indices
 from envs.graphs import MOST, WARM_UP, Graphed
 from safety import SafetyConfig, SafetyFilter
 from tests.standin_recording import StandInRecording
-from tests.test_recorder import counted_batch
+from tests.test_recorder import Look, counted_batch
 
 CPU = torch.device("cpu")
 
@@ -149,19 +149,22 @@ def trained(
     _, explore = make_policies(learner.actor, world, config.safety, agent, seeds, device, **config.computing)
     collection = make_collection(config, seeds, learners, explore, noises_of(explore), device, print)
     buffer, multi_step = make_buffer(1000, device, 0), MultiStep(agent.n_steps, agent.gamma)
-    recorder = TrainingRecorder(world, 4 * n_seeds, device, cuda_graphs=on)
+    counter = BatchCounter(world, n_seeds, cuda_graphs=on)
+    recorders = [TrainingRecorder(world, 4, device) for _ in seeds]
     found: dict[str, torch.Tensor] = {}
     for k, batch in enumerate(collection.batches(4 * n_seeds * iterations, resumed=False)):
-        recorder.update(batch)
+        for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
+            recorder.update(own, counted)
         rows = to_transitions(batch)
         if len(steps := multi_step(rows)):
-            buffer.extend(steps)
+            store(buffer, steps)
             minibatch = draw(buffer, 8 * n_seeds * (3 if agent.minibatch == "per_agent" else 1), learner.loss.reads)
             losses = update(minibatch.reshape(n_seeds, -1) if n_seeds > 1 else minibatch)
             found |= {f"{k} {name}": value for name, value in losses.items()}
         found |= {f"{k} {name}": value.clone() for name, value in batch.flatten_keys().items()}
-    numbers = recorder.summary()["filter"] | recorder.violations | {"cost": recorder.scalars()["train/coverage_cost"]}
-    found |= {name: torch.tensor(value) for name, value in numbers.items()}
+    for seed, recorder in zip(seeds, recorders, strict=True):
+        numbers = recorder.summary()["filter"] | recorder.violations | recorder.scalars()
+        found |= {f"{seed} {name}": torch.tensor(value) for name, value in numbers.items()}
     return found | {name: value for name, value in learner.loss.state_dict().items() if isinstance(value, torch.Tensor)}
 
 
@@ -262,20 +265,21 @@ def states(learner) -> dict:
 
 
 def test_a_recorded_count_tells_what_is_to_be_looked_at(recording):
-    recorder = TrainingRecorder(SurveillanceConfig(n_agents=2), 1, None, cuda_graphs=True)
+    world = SurveillanceConfig(n_agents=2)
+    look = Look(world, BatchCounter(world, cuda_graphs=True))
     for _ in range(WARM_UP + 2):
-        assert not recorder.update(counted_batch())
+        assert not look(counted_batch())
     assert StandInRecording.made == 1
     for key in [keys.OUTSIDE, *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS)]:
         batch = counted_batch()
         batch[key][0, 1, 0] = True
-        assert recorder.update(batch), key
+        assert look(batch), key
     for key in WATCHED.values():
         batch = counted_batch()
         batch[key][0, 0, 1] = float("nan")
-        assert recorder.update(batch), key
-    assert not recorder.update(counted_batch())
-    assert recorder.violations == dict.fromkeys(keys.VIOLATION_KINDS, 1)
+        assert look(batch), key
+    assert not look(counted_batch())
+    assert look.recorder.violations == dict.fromkeys(keys.VIOLATION_KINDS, 1)
 
 
 def test_graphs_need_fixed_sizes():

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from agents.divergence import WATCHED, DivergedError, check_batch, check_finite, check_weights
-from agents.recorder import Every, Seconds, TrainingRecorder
+from agents.recorder import BatchCounter, Every, Seconds, TrainingRecorder
 from envs import SurveillanceConfig, keys
 
 
@@ -42,19 +42,30 @@ def counted_batch():
     )
 
 
+class Look:
+    """Whether a batch is to be looked at, after it is counted."""
+
+    def __init__(self, world, counter):
+        self.counter, self.recorder = counter, TrainingRecorder(world, 1, None)
+
+    def __call__(self, batch):
+        return self.recorder.update(batch, *self.counter(batch))
+
+
 def test_a_batch_with_something_wrong_is_to_be_looked_at():
-    recorder = TrainingRecorder(SurveillanceConfig(n_agents=2), 1, None)
-    assert not recorder.update(counted_batch())
+    world = SurveillanceConfig(n_agents=2)
+    look = Look(world, BatchCounter(world))
+    assert not look(counted_batch())
     for key in [keys.OUTSIDE, *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS)]:
         batch = counted_batch()
         batch[key][0, 1, 0] = True
-        assert recorder.update(batch), key
+        assert look(batch), key
     for key in WATCHED.values():
         for bad in (float("nan"), float("inf"), -float("inf")):
             batch = counted_batch()
             batch[key][0, 0, 1] = bad
-            assert recorder.update(batch), key
-    assert not recorder.update(counted_batch())
+            assert look(batch), key
+    assert not look(counted_batch())
 
 
 def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
@@ -63,7 +74,7 @@ def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
     flags = {kind: batch[("next", *keys.VIOLATION, kind)] for kind in keys.VIOLATION_KINDS}
     flags["depleted"][0, 1, 0] = flags["stranded"][0, 1, 0] = True  # robot 0 at the second step, twice at once
     flags["collision"][0, 1] = True  # and both robots collide
-    recorder.update(batch)
+    recorder.update(batch, *BatchCounter(world)(batch))
     assert recorder.violations == {"depleted": 1, "stranded": 1, "overcharged": 0, "collision": 2}
     assert recorder.episodes.finished == {"return": [-1.0], "violations": [2.0]}
     assert recorder.summary()["frames"] == 2

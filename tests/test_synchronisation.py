@@ -16,8 +16,8 @@ from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, to_transitions
-from agents.recorder import TrainingRecorder
+from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.recorder import BatchCounter, TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv
 from tests.standin_recording import by_mask
@@ -71,7 +71,7 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
     collection = make_collection(config, [0], learners, explore, noises, CPU, print)
     batches = collection.batches(100 * num_envs, resumed=False)
     multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, CPU, 0)
-    recorder, counts = TrainingRecorder(world, num_envs, CPU), dict.fromkeys(MOST, 0.0)
+    counter, recorder, counts = BatchCounter(world), TrainingRecorder(world, num_envs, CPU), dict.fromkeys(MOST, 0.0)
     mode = Waits()
     readings = Readings(mode.found)
     for k in range(20):
@@ -86,11 +86,11 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
         with mode, readings:
             batch = next(batches)
             spent("collect")
-            recorder.update(batch)
+            recorder.update(batch, *counter(batch))
             spent("count")
             steps = multi_step(to_transitions(batch))
             if len(steps):
-                buffer.extend(steps)
+                store(buffer, steps)
             spent("store")
         if k >= 8:
             with mode, readings:

@@ -54,8 +54,8 @@ from agents.incident import check_violations
 from agents.learners import make_learners, make_update
 from agents.networks import make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, pick_device, to_transitions, use_threads
-from agents.recorder import Seconds, TrainingRecorder
+from agents.pipeline import MultiStep, draw, make_buffer, pick_device, store, to_transitions, use_threads
+from agents.recorder import BatchCounter, Seconds, TrainingRecorder
 from agents.training_config import Config
 from conf.schema import register, to_config
 from envs import SurveillanceEnv
@@ -233,7 +233,8 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
     minibatch = config.buffer.batch_size
     buffers = [make_buffer(config.buffer.capacity, device, seed) for seed in seeds]
-    recorders = [TrainingRecorder(config.env, worlds, device, **graphs) for _ in seeds]
+    counter = BatchCounter(config.env, n_seeds, **graphs)
+    recorders = [TrainingRecorder(config.env, worlds, device) for _ in seeds]
     folder = Path(tempfile.gettempdir())  # of violation.json; a violation ends the program
     seconds = Seconds("collect")
     seconds.watch("policy", explore)
@@ -241,16 +242,16 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
 
     def count(batch: TensorDictBase) -> None:
         seconds.spent("collect")
-        for recorder, own in zip(recorders, batch.chunk(n_seeds), strict=True):
-            if recorder.update(own):
+        for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
+            if recorder.update(own, counted):
                 check_violations(own, world=config.env, safety=config.safety, folder=folder)
                 check_batch(own, recorder.frames)
 
-    def store(batch: TensorDictBase) -> None:
+    def keep(batch: TensorDictBase) -> None:
         steps = multi_step(to_transitions(batch, config.train.violation_penalty))
         if len(steps):
             for buffer, own in zip(buffers, steps.chunk(n_seeds), strict=True):
-                buffer.extend(own)
+                store(buffer, own)
 
     per_batch, updates = n_seeds * config.collector.frames_per_batch, config.train.n_updates
     drawn: list[TensorDictBase] = []
@@ -264,9 +265,9 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
 
     batches = collection.batches(10**6 * per_batch, resumed=False)
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
-        store(next(batches))
+        keep(next(batches))
 
-    contestant = Contestant(batches, per_batch, updates, store, sample, update, count=count, device=device.type)
+    contestant = Contestant(batches, per_batch, updates, keep, sample, update, count=count, device=device.type)
     return contestant, seconds
 
 
