@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents.collection import make_collection, seeds_of_streams
+from agents.evaluation import Evaluator
 from agents.interruption import StopSignals
 from agents.learners import make_learners, make_update
 from agents.networks import acting, make_policies
@@ -78,10 +79,10 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     use_threads(config.threads, deterministic=config.deterministic)
     world, safety, seeds = config.env, config.safety, list(folders)
     noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
-    eval_env = SurveillanceEnv(world, config.eval.num_envs, device, **config.computing)
     graphs = {"cuda_graphs": config.cuda_graphs}
+    evaluator = Evaluator(SurveillanceEnv(world, config.eval.num_envs, device, **config.computing), **graphs)
     learners, learner = make_learners(
-        eval_env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
+        evaluator.env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
     )
     update = make_update(learner, config.agent, safety, **graphs)
     policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, **config.computing)
@@ -101,7 +102,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             waiting=multi_step.blocks[k],
             noise=noises[k],
             policy=TensorDictSequential(acting(learners[k].actor, **graphs), safety_filter),
-            eval_env=eval_env,
+            evaluator=evaluator,
             seconds=seconds,
         )
         for k, (seed, folder) in enumerate(folders.items())

@@ -2,19 +2,20 @@
 
 import math
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from envs import SurveillanceEnv, keys
 from envs.coverage import powered_coverage_cost
-from envs.metrics import ChargeCounter, minimum_distance
+from envs.graphs import graphed
+from envs.metrics import Charges, minimum_distance
 from envs.rendering import Trajectory
-from safety.statistics import FilterStatistics
+from safety.statistics import MARGINS, SUMS, FilterStatistics
 
 RECORD_LIMIT = 2000  # samples of the recorded world by default; longer rollouts keep every n-th
 
@@ -24,97 +25,189 @@ def rollout_steps(horizon: int) -> int:
     return horizon or 1000
 
 
-@torch.no_grad()
-def evaluate_policy(
-    env: SurveillanceEnv,
-    policy: TensorDictModuleBase,
-    steps: int,
-    *,
-    record: bool = False,
-    samples: int = RECORD_LIMIT,
-    restart: bool = False,
-    check: Callable[[TensorDictBase, Tensor], None] | None = None,
-) -> tuple[dict, dict, Trajectory | None]:
-    """Roll a filtered policy out from fresh start states; a world counts until it terminates (a time limit does not end it).
+READ: list[NestedKey] = [
+    *(
+        keys.POSITION,
+        keys.ENERGY,
+        keys.STATUS,
+        keys.LEVEL,
+        keys.CORRECTION,
+        keys.RESIDUAL,
+        keys.OUTSIDE,
+        *MARGINS.values(),
+    ),
+    *(("next", key) for key in (keys.POSITION, keys.ENERGY, keys.COVERAGE_COST, keys.DENSITY, "terminated")),
+    *(("next", *key) for key in (keys.REWARD, *((*keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS))),
+]
+"""What is measured of a transition."""
+ADDED = ("worlds", "cost", "powered", "reward", *keys.VIOLATION_KINDS, *SUMS)
+"""What is summed over the worlds that count and the steps."""
+LEAST = ("energy_margin", "distance_margin", "residual", *MARGINS)
+"""What the least is kept of."""
+
+
+class Measured(NamedTuple):
+    """A rollout so far."""
+
+    alive: Tensor
+    """Worlds that count, ``(B, 1)`` bool."""
+    charges: Charges
+    """Of all robots."""
+    sums: Tensor
+    """In the order of ``ADDED``, float64."""
+    least: Tensor
+    """In the order of ``LEAST``, float64; "residual" is minus the largest."""
+
+
+class Evaluator:
+    """Deterministic rollouts in the worlds of an environment.
 
     Args:
-        env: the worlds; reset here.
-        policy: writes ("agents", "action") and the filter's diagnostics.
-        steps: length of the rollout.
-        record: keep the history of the first world.
-        samples: and this many samples of it at most, evenly spread; about 1 kB each (more with a moving density).
-        restart: draw a terminated world anew and go on counting in it.
-        check: called with every transition and the worlds that count, ``(*B, 1)`` bool, such as
-            :func:`agents.incident.check_violations`.
-
-    Returns:
-        Metrics (the block ``eval`` of summary.json), the filter's statistics and the history, if recorded.
+        env: the worlds. All policies write the same keys.
+        cuda_graphs: record the measuring and replay it (:mod:`envs.graphs`).
     """
-    config = env.config
-    td = env.reset()
-    alive = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
-    total = {
-        name: torch.zeros((), dtype=torch.float64, device=env.device)
-        for name in ("cost", "powered", "reward", "worlds")
-    }
-    violations = {kind: torch.zeros((), dtype=torch.int64, device=env.device) for kind in keys.VIOLATION_KINDS}
-    energy_margin = distance_margin = torch.full((), math.inf, dtype=config.torch_dtype, device=env.device)
-    charges = ChargeCounter(td[keys.ENERGY].squeeze(-1), config)
-    statistics = FilterStatistics(config.max_speed)
-    restarts = torch.zeros((), dtype=torch.int64, device=env.device)
-    history = _History(env, every=math.ceil(steps / samples)) if record else None
-    for k in range(steps):
-        td = env.step(policy(td))
+
+    def __init__(self, env: SurveillanceEnv, *, cuda_graphs: bool = False) -> None:
+        self.env, self.recorded = env, cuda_graphs
+        self._measure = graphed(self._measure_tensors, enabled=cuda_graphs)
+        self._keys: list[NestedKey] = []
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        policy: TensorDictModuleBase,
+        steps: int,
+        *,
+        record: bool = False,
+        samples: int = RECORD_LIMIT,
+        restart: bool = False,
+        check: Callable[[TensorDictBase, Tensor], None] | None = None,
+    ) -> tuple[dict, dict, Trajectory | None]:
+        """Roll a filtered policy out from fresh start states; a world counts until it terminates (a time limit does not end it).
+
+        Args:
+            policy: writes ("agents", "action") and the filter's diagnostics.
+            steps: length of the rollout.
+            record: keep the history of the first world.
+            samples: and this many samples of it at most, evenly spread; about 1 kB each (more with a moving density).
+            restart: draw a terminated world anew and go on counting in it.
+            check: called with every transition and the worlds that count, ``(*B, 1)`` bool, such as
+                :func:`agents.incident.check_violations`.
+
+        Returns:
+            Metrics (the block ``eval`` of summary.json), the filter's statistics and the history, if recorded.
+        """
+        env = self.env
+        td = env.reset()
+        alive = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
+        charges = Charges.none(td[keys.ENERGY].squeeze(-1))
+        kind = {"dtype": torch.float64, "device": env.device}
+        sums, least = torch.zeros(len(ADDED), **kind), torch.full((len(LEAST),), math.inf, **kind)
+        measured = Measured(alive, charges, sums, least)
+        restarts = torch.zeros((), dtype=torch.int64, device=env.device)
+        history = _History(env, every=math.ceil(steps / samples)) if record else None
+        for k in range(steps):
+            td = env.step(policy(td))
+            alive, following = measured.alive, td["next"]
+            measured = self._after(measured, td)
+            if history is not None:
+                history.add(k, td, alive)
+            if check is not None:
+                check(td, alive)
+            ended, td = following["terminated"], step_mdp(td)
+            if restart:
+                restarts += (ended & alive).sum()
+                measured = measured._replace(alive=alive)
+                if ended.any():
+                    td = env.reset(td.set("_reset", ended))
+                    begun = measured.charges.restarted(td[keys.ENERGY].squeeze(-1), ended)
+                    measured = measured._replace(charges=begun)
+        metrics, statistics = self._numbers(measured)
+        if restart:
+            metrics["terminated_worlds"] = int(restarts)
+        return metrics, statistics, None if history is None else history.trajectory()
+
+    def _after(self, measured: Measured, td: TensorDictBase) -> Measured:
+        """With another transition taken in."""
+        self._keys = self._keys or [key for key in READ if key in td.keys(True)]
+        alive, charges, sums, least = measured
+        found = self._measure(alive, *charges, sums, least, *(td[key] for key in self._keys))
+        return Measured(found[0], Charges(*found[1:4]), *found[4:])
+
+    def _measure_tensors(
+        self,
+        alive: Tensor,
+        start: Tensor,
+        counted: Tensor,
+        count: Tensor,
+        sums: Tensor,
+        least: Tensor,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """:class:`Measured` after a transition whose tensors are in the order of ``_keys``."""
+        config = self.env.config
+        td = TensorDict(dict(zip(self._keys, tensors, strict=True)), alive.shape[:1])
         following = td["next"]
         energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
-        total["worlds"] += alive.sum()
-        total["cost"] += torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64)
-        total["powered"] += torch.where(alive, _powered_cost(env, following), 0).sum(dtype=torch.float64)
-        total["reward"] += torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64)
-        for kind in violations:
-            violations[kind] += (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
+        found = {
+            "worlds": alive.sum(),
+            "cost": torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64),
+            "powered": torch.where(alive, self._powered_cost(following), 0).sum(dtype=torch.float64),
+            "reward": torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64),
+        }
+        for kind in keys.VIOLATION_KINDS:
+            found[kind] = (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
         margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
-        energy_margin = torch.minimum(energy_margin, torch.where(alive, margin, math.inf).min())
         gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
-        distance_margin = torch.minimum(distance_margin, torch.where(alive.squeeze(-1), gap, math.inf).min())
-        charges.update(energy, next_energy, alive)
-        statistics.update(td, alive)
-        if history is not None and alive[0]:
-            history.add(k, td)
-        if check is not None:
-            check(td, alive)
-        ended, td = following["terminated"], step_mdp(td)
-        if restart:
-            restarts += (ended & alive).sum()
-            if ended.any():
-                td = env.reset(td.set("_reset", ended))
-                charges.restart(td[keys.ENERGY].squeeze(-1), ended)
-        else:
-            alive = alive & ~ended
-    metrics = {
-        "coverage_cost": _finite(total["cost"] / total["worlds"].clamp_min(1)),
-        "powered_coverage_cost": _finite(total["powered"] / total["worlds"].clamp_min(1)),
-        "episode_reward": _finite(total["reward"] / env.batch_size.numel()),
-        "violations": {kind: int(count) for kind, count in violations.items()},
-        "charges_per_robot": float(charges.count.to(torch.float64).mean()),
-        "min_energy_margin": _finite(energy_margin),
-        "min_distance_margin": _finite(distance_margin),
-        "robot_steps": int(total["worlds"]) * config.n_agents,
-        "terminated_worlds": int(restarts) if restart else int((~alive).sum()),
-    }
-    return metrics, statistics.summary(), None if history is None else history.trajectory()
+        found |= FilterStatistics(config.max_speed).numbers(td, alive)
+        found["energy_margin"] = torch.where(alive, margin, math.inf).min()
+        found["distance_margin"] = torch.where(alive.squeeze(-1), gap, math.inf).min()
+        found["residual"] = -found["max_residual"]
+        absent = least.new_full((), math.inf)  # a barrier that the filter does not write
+        sums = sums + torch.stack([found[name].double() for name in ADDED])
+        now = torch.stack([found.get(name, absent).double() for name in LEAST])
+        # a margin that is not a number stays so; a barrier that is not a number is passed over
+        least = torch.cat([torch.minimum(least[:2], now[:2]), torch.fmin(least[2:], now[2:])])
+        charges = Charges(start, counted, count).after(energy, next_energy, alive, config)
+        return alive & ~following["terminated"], *charges, sums, least
+
+    def _powered_cost(self, state: TensorDictBase) -> Tensor:
+        """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""
+        powered = (state[keys.ENERGY] >= self.env.config.energy_min).squeeze(-1)
+        if not self.recorded and powered.all():
+            return state[keys.COVERAGE_COST]
+        density, position = self.env.density, state[keys.POSITION]
+        params = state[keys.DENSITY] if density.n_params else position.new_zeros(len(position), 0)
+        rest = (density.points, density.weights(params), density.cell_moment)
+        cost = powered_coverage_cost(position, powered, *rest, diameter=self.env.config.diameter).unsqueeze(-1)
+        return torch.where(powered.all(dim=-1, keepdim=True), state[keys.COVERAGE_COST], cost)
+
+    def _numbers(self, measured: Measured) -> tuple[dict, dict]:
+        """Metrics and the filter's statistics, read from the device."""
+        sums = dict(zip(ADDED, measured.sums.tolist(), strict=True))
+        least = dict(zip(LEAST, measured.least.tolist(), strict=True))
+        worlds = max(sums["worlds"], 1)
+        metrics = {
+            "coverage_cost": _finite(sums["cost"] / worlds),
+            "powered_coverage_cost": _finite(sums["powered"] / worlds),
+            "episode_reward": _finite(sums["reward"] / self.env.batch_size.numel()),
+            "violations": {kind: int(sums[kind]) for kind in keys.VIOLATION_KINDS},
+            "charges_per_robot": float(measured.charges.count.to(torch.float64).mean()),
+            "min_energy_margin": _finite(least["energy_margin"]),
+            "min_distance_margin": _finite(least["distance_margin"]),
+            "robot_steps": int(sums["worlds"]) * self.env.config.n_agents,
+            "terminated_worlds": int((~measured.alive).sum()),
+        }
+        statistics = FilterStatistics(self.env.config.max_speed)
+        statistics.add(sums | least | {"max_residual": -least["residual"]})
+        return metrics, statistics.summary()
 
 
-def _powered_cost(env: SurveillanceEnv, state: TensorDictBase) -> Tensor:
-    """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""
-    powered = (state[keys.ENERGY] >= env.config.energy_min).squeeze(-1)
-    if powered.all():
-        return state[keys.COVERAGE_COST]
-    density, position = env.density, state[keys.POSITION]
-    params = state[keys.DENSITY] if density.n_params else position.new_zeros(len(position), 0)
-    rest = (density.points, density.weights(params), density.cell_moment)
-    cost = powered_coverage_cost(position, powered, *rest, diameter=env.config.diameter).unsqueeze(-1)
-    return torch.where(powered.all(dim=-1, keepdim=True), state[keys.COVERAGE_COST], cost)
+def evaluate_policy(
+    env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, **options: Any
+) -> tuple[dict, dict, Trajectory | None]:
+    """A single rollout of :class:`Evaluator`, with its options."""
+    return Evaluator(env)(policy, steps, **options)
 
 
 def evaluation_scalars(metrics: dict) -> dict[str, float]:
@@ -125,45 +218,47 @@ def evaluation_scalars(metrics: dict) -> dict[str, float]:
     return scalars | {f"eval/violations_{kind}": count for kind, count in metrics["violations"].items()}
 
 
-def _finite(value: Tensor) -> float | None:
+def _finite(value: float) -> float | None:
     """None (JSON null) where there is nothing to measure: one robot's distance, the cost of an unfiltered NaN action."""
-    return float(value) if math.isfinite(value) else None
+    return value if math.isfinite(value) else None
 
 
 class _History:
-    """History of the first world, every ``every``-th step."""
+    """History of the first world, every ``every``-th step until it ends, kept where the world is."""
 
     def __init__(self, env: SurveillanceEnv, every: int) -> None:
         self.env, self.every = env, every
-        self.samples: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("position", "energy", "charging", "slot", "density", "coverage_cost")
+        self.samples: dict[str, list[Tensor]] = {
+            name: [] for name in ("alive", "position", "energy", "charging", "slot", "density", "coverage_cost")
         }
 
-    def add(self, k: int, td) -> None:
+    def add(self, k: int, td: TensorDictBase, alive: Tensor) -> None:
         """Take in transition k (its next state)."""
         if k % self.every:
             return
         following, density = td["next"], self.env.density
         params = following.get(keys.DENSITY, None)
-        weights = density.weights(following[keys.POSITION].new_zeros(1, 0) if params is None else params[:1])
         rows = {
+            "alive": alive[0, 0],
             "position": following[keys.POSITION][0],
             "energy": following[keys.ENERGY][0, :, 0],
             "charging": (following[keys.ENERGY] > td[keys.ENERGY])[0, :, 0],
             "slot": following[keys.SLOT][0, :, 0],
-            "density": weights.reshape(-1),
             "coverage_cost": following[keys.COVERAGE_COST][0, 0],
         }
+        if density.n_params or not self.samples["density"]:
+            weights = density.weights(following[keys.POSITION].new_zeros(1, 0) if params is None else params[:1])
+            rows["density"] = weights.reshape(-1)
         for name, row in rows.items():
-            if name != "density" or density.n_params or not self.samples["density"]:
-                self.samples[name].append(row.cpu().numpy().copy())
+            self.samples[name].append(row.clone())
 
     def trajectory(self) -> Trajectory:
         """The history for :mod:`envs.rendering`."""
         env, config = self.env, self.env.config
-        arrays = {name: np.stack(rows) for name, rows in self.samples.items()}
+        arrays = {name: torch.stack(rows).cpu().numpy() for name, rows in self.samples.items()}
+        length = int(arrays.pop("alive").sum())
         return Trajectory(
-            **arrays,
+            **{name: rows[:length] for name, rows in arrays.items()},
             points=env.density.points.cpu().numpy(),
             stations=env.stations.cpu().numpy(),
             slots=env.slots.cpu().numpy(),

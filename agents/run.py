@@ -16,7 +16,7 @@ from agents.board import Board
 from agents.checkpoint import CheckpointError, world_sizes
 from agents.collection import Block, WorkerBlock, seeds_of_streams
 from agents.divergence import DivergedError, check_batch, check_finite, check_weights
-from agents.evaluation import evaluate_policy, evaluation_scalars, rollout_steps
+from agents.evaluation import Evaluator, evaluation_scalars, rollout_steps
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
 from agents.noise import ExplorationNoise
@@ -24,7 +24,7 @@ from agents.pipeline import WaitingSteps, draw, make_buffer, store
 from agents.recorder import Counted, Every, Seconds, TrainingRecorder
 from agents.training_config import Config
 from agents.training_state import TrainingState, valid_ages
-from envs import SurveillanceEnv, keys
+from envs import keys
 from envs.rendering import save_training_curve
 
 FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
@@ -66,7 +66,7 @@ class TrainingRun:
         waiting: its steps that wait for n-step transitions.
         noise: its exploration noise.
         policy: deployment policy of its networks.
-        eval_env: the worlds of evaluations, shared by all runs.
+        evaluator: rolls policies out, for all runs.
         seconds: where the program's time goes.
     """
 
@@ -83,15 +83,15 @@ class TrainingRun:
         waiting: WaitingSteps,
         noise: ExplorationNoise,
         policy: TensorDictSequential,
-        eval_env: SurveillanceEnv,
+        evaluator: Evaluator,
         seconds: Seconds,
     ) -> None:
         self.folder, self.config, self.seed, self.origin, self.settings = folder, config, seed, origin, settings
-        self.worlds, self.learner, self.noise, self.policy, self.eval_env = worlds, learner, noise, policy, eval_env
+        self.worlds, self.learner, self.noise, self.policy, self.evaluator = worlds, learner, noise, policy, evaluator
         self.error: Exception | None = None
         """What ended the run before its time, where it shares its program with others."""
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
-        device, agent = eval_env.device, config.agent
+        device, agent = evaluator.env.device, config.agent
         self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
         self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
@@ -104,7 +104,7 @@ class TrainingRun:
         parts = {"actor": learner.actor, "loss": learner.loss, "optimizers": learner.optimizers, "env": worlds}
         parts |= {"noise": noise, "multi_step": waiting, "recorder": self.recorder, "clocks": self.clocks}
         parts |= {"seconds": seconds}
-        made_for = {"config": settings, "world": world_sizes(eval_env)}
+        made_for = {"config": settings, "world": world_sizes(evaluator.env)}
         keep, with_buffer = config.checkpoint.keep, config.checkpoint.buffer
         self.state = TrainingState(folder, parts, self.buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
         self.check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
@@ -138,10 +138,10 @@ class TrainingRun:
 
     def evaluate(self) -> None:
         """Measure the deployment policy, from the same start states every time."""
-        self.eval_env.set_seed(self.eval_seed)
+        self.evaluator.env.set_seed(self.eval_seed)
         steps = self.config.eval.steps or rollout_steps(self.config.env.horizon)
-        metrics, statistics, trajectory = evaluate_policy(
-            self.eval_env, self.policy, steps, record=self.board.records, check=self.check
+        metrics, statistics, trajectory = self.evaluator(
+            self.policy, steps, record=self.board.records, check=self.check
         )
         self.board.scalars(evaluation_scalars(metrics), self.recorder.frames)
         self.board.world(trajectory, self.recorder.frames)

@@ -4,6 +4,7 @@ All comparisons are written so that NaN counts as a violation.
 """
 
 import functools
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,29 +79,35 @@ def minimum_distance(position: Tensor, next_position: Tensor) -> Tensor:
     return torch.nn.functional.pad(gap, (0, 1), value=torch.inf).amin(dim=-1)
 
 
-class ChargeCounter:
-    """Counts charges: intervals of rising energy that gain at least 20 % of the battery's range."""
+class Charges(NamedTuple):
+    """Charges so far: intervals of rising energy that gain at least 20 % of the battery's range."""
 
-    def __init__(self, energy: Tensor, config: SurveillanceConfig) -> None:
-        self.threshold = 0.2 * (config.energy_max - config.energy_min)
-        self.start = energy.clone()
-        self.counted = torch.zeros_like(energy, dtype=torch.bool)
-        self.count = torch.zeros_like(energy, dtype=torch.int64)
+    start: Tensor
+    """Energy where the interval began, ``(B, N)``."""
+    counted: Tensor
+    """Whether the interval has been counted, ``(B, N)`` bool."""
+    count: Tensor
+    """``(B, N)`` int64."""
 
-    def update(self, energy: Tensor, next_energy: Tensor, alive: Tensor) -> None:
-        """Take in one transition, ``(*B, N)`` each; ``alive`` ``(*B, 1)`` masks worlds that have ended."""
+    @classmethod
+    def none(cls, energy: Tensor) -> "Charges":
+        """Before the first step, of robots with ``energy`` ``(B, N)``."""
+        return cls(
+            energy.clone(), torch.zeros_like(energy, dtype=torch.bool), torch.zeros_like(energy, dtype=torch.int64)
+        )
+
+    def after(self, energy: Tensor, next_energy: Tensor, alive: Tensor, config: SurveillanceConfig) -> "Charges":
+        """With one transition taken in, ``(B, N)`` each; ``alive`` ``(B, 1)`` masks worlds that have ended."""
+        threshold = 0.2 * (config.energy_max - config.energy_min)
         rising = next_energy > energy
-        # a pause ends the interval
-        self.counted = self.counted & rising
-        self.start = torch.where(rising, self.start, next_energy)
-        reached = rising & ~self.counted & (next_energy - self.start >= self.threshold) & alive
-        self.count += reached
-        self.counted = self.counted | reached
+        counted = self.counted & rising  # a pause ends the interval
+        start = torch.where(rising, self.start, next_energy)
+        reached = rising & ~counted & (next_energy - start >= threshold) & alive
+        return Charges(start, counted | reached, self.count + reached)
 
-    def restart(self, energy: Tensor, worlds: Tensor) -> None:
-        """Begin anew in the ``worlds`` ``(*B, 1)`` bool, whose robots now have ``energy`` ``(*B, N)``; the counts stay."""
-        self.start = torch.where(worlds, energy, self.start)
-        self.counted = self.counted & ~worlds
+    def restarted(self, energy: Tensor, worlds: Tensor) -> "Charges":
+        """Begun anew in the ``worlds`` ``(B, 1)`` bool, whose robots now have ``energy`` ``(B, N)``; the counts stay."""
+        return Charges(torch.where(worlds, energy, self.start), self.counted & ~worlds, self.count)
 
 
 class EpisodeTracker:

@@ -17,6 +17,7 @@ MARGINS = {
     "min_certificate_margin": keys.BARRIER_CERTIFICATE,
 }
 """Least barriers by name: survivability and overcharge (energy), collision (m^2), G - Delta_G (m)."""
+SUMS = ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside", "homing")
 
 
 class FilterStatistics:
@@ -28,19 +29,7 @@ class FilterStatistics:
 
     def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
-        self.sums = dict.fromkeys(
-            (
-                "robot_steps",
-                "interventions",
-                "correction",
-                "fallbacks",
-                "infeasible",
-                "inaccurate",
-                "outside",
-                "homing",
-            ),
-            0.0,
-        )
+        self.sums = dict.fromkeys(SUMS, 0.0)
         self.max_residual = 0.0
         self.least: dict[str, float] = {}
 
@@ -69,7 +58,7 @@ class FilterStatistics:
             counts & tensordict[keys.OUTSIDE],
             counts & (level == HOMING),
         )
-        found: dict[str, Tensor] = dict(zip(self.sums, (row.sum(dtype=torch.float64) for row in rows), strict=True))
+        found: dict[str, Tensor] = dict(zip(SUMS, (row.sum(dtype=torch.float64) for row in rows), strict=True))
         found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
         margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
         for name, x in margins.items():
@@ -79,7 +68,7 @@ class FilterStatistics:
 
     def add(self, found: dict[str, float]) -> None:
         """Add what was read of :meth:`numbers`."""
-        for name in self.sums:
+        for name in SUMS:
             self.sums[name] += found[name]
         self.max_residual = max(self.max_residual, found["max_residual"])
         for name in MARGINS:

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictSequential
 from agents.collection import make_collection
 from agents.config import AgentConfig
 from agents.divergence import WATCHED
-from agents.evaluation import evaluate_policy
+from agents.evaluation import Evaluator
 from agents.learners import make_learners, make_update
 from agents.networks import acting, make_actor, make_policies
 from agents.noise import noises_of
@@ -202,12 +202,13 @@ def test_evaluation_is_the_same(recording, restart, mode):
         sizes = {"fixed_sizes": True, "cuda_graphs": on}
         env = SurveillanceEnv(world, 6, seed=2, **sizes)
         policy = TensorDictSequential(acting(actor, cuda_graphs=on), SafetyFilter(safety, world, **sizes))
-        found = [evaluate_policy(env, policy, 60, record=True, restart=restart) for _ in range(2)]
+        evaluator = Evaluator(env, cuda_graphs=on)
+        found = [evaluator(policy, 60, record=True, restart=restart) for _ in range(2)]
         return [metrics | statistics for metrics, statistics, _ in found], found[1][2].position
 
     with torch.no_grad():
         found, positions = evaluated(on=True)
-        assert StandInRecording.made == 3  # actor, filter and step
+        assert StandInRecording.made == 4  # actor, filter, step and measuring
         expected, expected_positions = evaluated(on=False)
     assert found == expected
     assert (positions == expected_positions).all()

@@ -6,7 +6,7 @@ import torch
 
 from envs import SurveillanceConfig
 from envs.keys import VIOLATION_KINDS
-from envs.metrics import ChargeCounter, EpisodeTracker, minimum_distance, violations
+from envs.metrics import Charges, EpisodeTracker, minimum_distance, violations
 
 # every number is a sum of powers of two: "exactly at the limit" is exact in binary
 WORLD = SurveillanceConfig(
@@ -187,11 +187,11 @@ def test_minimum_distance_is_where_the_collision_flag_switches():
 def charges(levels, alive=None):
     """Charges counted along one robot's energies; the threshold is 20 % of 0.75 = 0.15."""
     levels = [torch.tensor([[e]], dtype=torch.float64) for e in levels]
-    counter = ChargeCounter(levels[0], WORLD)
+    found = Charges.none(levels[0])
     alive = [True] * (len(levels) - 1) if alive is None else alive
     for a, b, living in zip(levels[:-1], levels[1:], alive, strict=True):
-        counter.update(a, b, torch.tensor([[living]]))
-    return int(counter.count)
+        found = found.after(a, b, torch.tensor([[living]]), WORLD)
+    return int(found.count)
 
 
 def test_a_gain_of_a_fifth_counts_once():
@@ -225,9 +225,9 @@ def test_ended_worlds_do_not_count():
 
 
 def test_robots_count_apart():
-    counter = ChargeCounter(torch.full((2, 2), 0.25), WORLD)
-    counter.update(torch.full((2, 2), 0.25), torch.tensor([[0.9, 0.25], [0.3, 0.9]]), torch.tensor([[True], [True]]))
-    assert counter.count.tolist() == [[1, 0], [0, 1]]
+    before, after = torch.full((2, 2), 0.25), torch.tensor([[0.9, 0.25], [0.3, 0.9]])
+    found = Charges.none(before).after(before, after, torch.tensor([[True], [True]]), WORLD)
+    assert found.count.tolist() == [[1, 0], [0, 1]]
 
 
 # ---- episodes ---------------------------------------------------------------------------------------------------------
