@@ -12,7 +12,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
 from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
-from agents.pipeline import MultiStep, make_buffer, to_transitions
+from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -587,8 +587,19 @@ def test_rows_written_as_slices_lie_where_torchrl_puts_them(capacity):
     )
     for _ in range(30):
         count = int(torch.randint(1, 8, (), generator=generator))
-        rows = TensorDict({"a": torch.randn(count, 2, generator=generator)}, [count])
-        assert torch.equal(mine.extend(rows.clone()), theirs.extend(rows.clone()))
+        rows = TensorDict(
+            {
+                "a": torch.randn(count, 2, generator=generator),
+                "next": {"b": torch.randn(count, generator=generator) > 0},
+            },
+            [count],
+        )
+        store(mine, rows.clone())
+        theirs.extend(rows.clone())
         assert len(mine) == len(theirs)
         assert mine.writer.state_dict() == theirs.writer.state_dict()
         assert (mine.storage.get(slice(0, len(mine))) == theirs.storage.get(slice(0, len(mine)))).all()
+        sample, own = theirs[: len(mine)], draw(mine, 4, ["a", ("next", "b")])
+        assert set(own.keys(True, True)) == {"a", ("next", "b")}
+        for a, b in zip(own["a"], own["next", "b"], strict=True):
+            assert b == sample["next", "b"][(sample["a"] == a).all(-1)]

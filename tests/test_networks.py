@@ -18,7 +18,7 @@ from agents.networks import (
     make_critic,
     make_policies,
 )
-from agents.noise import ExplorationNoise
+from agents.noise import ExplorationNoise, NoiseOfSeeds
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -213,6 +213,25 @@ def test_noise_has_the_stated_standard_deviation(kind):
 
 def correlation(x, y):
     return ((x * y).mean() / (x.square().mean() * y.square().mean()).sqrt()).item()
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "ou"])
+def test_noise_of_several_learners_is_that_of_each_alone(kind):
+    fields = {"noise_spread": 0.7, "initial": 1.0, "final": 0.2, "frames": 60}
+    alone, parts = ([noise_of(kind, seed=seed, **fields) for seed in (3, 8)] for _ in range(2))
+    together = NoiseOfSeeds(parts)
+    for k in range(12):
+        if k == 5:  # as from a checkpoint
+            for part in parts:
+                part.set_extra_state(part.get_extra_state())
+        step = 0 if k in (0, 7) else k
+        both = draw(together, step, worlds=8)
+        assert torch.equal(both, torch.cat([draw(noise, step, worlds=4) for noise in alone]))
+        assert [part.frames for part in parts] == [noise.frames for noise in alone]
+    assert both.abs().max() > 0
+    parts[1].frames += 4
+    with pytest.raises(ValueError, match=r"\[48, 52\] frames"):
+        draw(together, 1, worlds=8)
 
 
 def test_gaussian_noise_is_white_and_ou_is_not():

@@ -68,6 +68,20 @@ def test_a_batch_with_something_wrong_is_to_be_looked_at():
     assert not look(counted_batch())
 
 
+def test_several_learners_are_counted_as_each_alone():
+    world, batches = SurveillanceConfig(n_agents=2), [counted_batch() for _ in range(3)]
+    for k, batch in enumerate(batches):
+        batch["next", keys.COVERAGE_COST] += k
+        batch[keys.OUTSIDE][0, : k % 3, 0] = True
+        batch["next", *keys.VIOLATION, "collision"][0, :k] = True
+    together = BatchCounter(world, 3)(torch.cat(batches))
+    for counted, batch in zip(together, batches, strict=True):
+        (alone,) = BatchCounter(world)(batch)
+        assert counted.sums == alone.sums
+        assert torch.equal(counted.violating, alone.violating)
+    assert [counted.sums["collision"] for counted in together] == [0, 2, 4]
+
+
 def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
     world = SurveillanceConfig(n_agents=2)
     recorder, batch = TrainingRecorder(world, 1, None), counted_batch()
