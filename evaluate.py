@@ -82,9 +82,10 @@ def main(cfg: DictConfig) -> None:
     announce_certificate(folder, world)
     check = functools.partial(check_violations, world=world, safety=safety, folder=folder)
     start = time.perf_counter()
-    metrics, statistics, trajectory = Evaluator(env, cuda_graphs=config.cuda_graphs)(
+    (found,) = Evaluator(env, cuda_graphs=config.cuda_graphs)(
         policy, steps, record=config.pictures, samples=config.samples, restart=config.restart, check=check
     )
+    metrics, statistics, trajectory = found
     content = {
         **metrics,
         "filter": statistics,

@@ -13,14 +13,14 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
+from agents.checkpoint import world_sizes
 from agents.collection import make_collection, seeds_of_streams
 from agents.evaluation import Evaluator
 from agents.interruption import StopSignals
 from agents.learners import make_learners, make_update
-from agents.networks import acting, make_policies
+from agents.networks import make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import BatchCounter, Seconds
@@ -31,6 +31,7 @@ from agents.run import (
     check_seeds,
     equally_far,
     errors_by_seed,
+    evaluate,
     for_each,
     minibatches,
     shares,
@@ -80,19 +81,20 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     world, safety, seeds = config.env, config.safety, list(folders)
     noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
     graphs = {"cuda_graphs": config.cuda_graphs}
-    evaluator = Evaluator(SurveillanceEnv(world, config.eval.num_envs, device, **config.computing), **graphs)
+    eval_env = SurveillanceEnv(world, len(seeds) * config.eval.num_envs, device, seeds, **config.computing)
+    evaluator = Evaluator(eval_env, **graphs)
     learners, learner = make_learners(
-        evaluator.env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
+        eval_env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
     )
     update = make_update(learner, config.agent, safety, **graphs)
-    policies = make_policies(learner.actor, world, safety, config.agent, noise_seeds, device, **config.computing)
-    (_, safety_filter), explore_policy = policies
+    modules = (learner.actor, world, safety, config.agent)
+    policy, explore_policy = make_policies(*modules, noise_seeds, device, **config.computing)
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
     counter, adversary = BatchCounter(world, len(folders), **graphs), config.adversary_reward()
     seconds.watch("policy", explore_policy)
-    seconds.watch("filter", safety_filter)
+    seconds.watch("filter", explore_policy[-1])
     origin, settings = run_origin(cfg, device), hashed_config(cfg)
     runs = [
         TrainingRun(
@@ -101,8 +103,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             worlds=collection.blocks[k],
             waiting=multi_step.blocks[k],
             noise=noises[k],
-            policy=TensorDictSequential(acting(learners[k].actor, **graphs), safety_filter),
-            evaluator=evaluator,
+            sizes=world_sizes(eval_env),
             seconds=seconds,
         )
         for k, (seed, folder) in enumerate(folders.items())
@@ -117,7 +118,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
         announce_certificate(run.folder, world, show=run is runs[0])
     seconds.spent("build")
     if not start:
-        for_each(runs, TrainingRun.evaluate)  # the untrained policies
+        evaluate(runs, evaluator, policy)  # untrained
     seconds.spent("evaluate")
 
     # ---- train: noise, then filter, then execution (explore_policy); the buffers hold executed and nominal actions
@@ -139,7 +140,9 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             for_each(runs, TrainingRun.log, [losses] * n_runs, [seconds] * n_runs, range(n_runs))
             bar.set_postfix_str(runs[0].progress, refresh=False)
             bar.update(batch.numel())
-            for_each(runs, TrainingRun.evaluate_when_due)
+            due = [run.evaluates for run in runs]
+            if any(due):
+                evaluate(runs, evaluator, policy)
             seconds.spent("evaluate")
             due = [run.saves for run in runs]
             if any(due) or stop.received:

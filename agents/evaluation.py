@@ -1,7 +1,7 @@
 """Deterministic rollouts of a policy in many worlds, measured as they run (nothing is stored but one world's history)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -47,20 +47,31 @@ LEAST = ("energy_margin", "distance_margin", "residual", *MARGINS)
 
 
 class Measured(NamedTuple):
-    """A rollout so far."""
+    """Rollouts so far, of the worlds of all seeds."""
 
     alive: Tensor
     """Worlds that count, ``(B, 1)`` bool."""
     charges: Charges
     """Of all robots."""
     sums: Tensor
-    """In the order of ``ADDED``, float64."""
+    """In the order of ``ADDED``, ``(seeds, n)`` float64."""
     least: Tensor
-    """In the order of ``LEAST``, float64; "residual" is minus the largest."""
+    """In the order of ``LEAST``, ``(seeds, n)`` float64; "residual" is minus the largest."""
+
+
+class Evaluation(NamedTuple):
+    """What came of the rollout of a seed."""
+
+    metrics: dict
+    """The block ``eval`` of summary.json."""
+    statistics: dict
+    """What the filter did."""
+    trajectory: Trajectory | None
+    """History of the first world, if recorded."""
 
 
 class Evaluator:
-    """Deterministic rollouts in the worlds of an environment.
+    """Deterministic rollouts in the worlds of an environment, of a policy per seed of the environment.
 
     Args:
         env: the worlds. All policies write the same keys.
@@ -78,54 +89,64 @@ class Evaluator:
         policy: TensorDictModuleBase,
         steps: int,
         *,
+        seeds: Sequence[int] = (),
         record: bool = False,
         samples: int = RECORD_LIMIT,
         restart: bool = False,
         check: Callable[[TensorDictBase, Tensor], None] | None = None,
-    ) -> tuple[dict, dict, Trajectory | None]:
+    ) -> list[Evaluation]:
         """Roll a filtered policy out from fresh start states; a world counts until it terminates (a time limit does not end it).
 
         Args:
-            policy: writes ("agents", "action") and the filter's diagnostics.
+            policy: writes ("agents", "action") and the filter's diagnostics; of several learners if the worlds have several
+                seeds, each in its block (:mod:`envs.blocks`).
             steps: length of the rollout.
-            record: keep the history of the first world.
+            seeds: of the start states, one per block; if not given, the streams go on.
+            record: keep the history of each block's first world.
             samples: and this many samples of it at most, evenly spread; about 1 kB each (more with a moving density).
             restart: draw a terminated world anew and go on counting in it.
             check: called with every transition and the worlds that count, ``(*B, 1)`` bool, such as
                 :func:`agents.incident.check_violations`.
 
         Returns:
-            Metrics (the block ``eval`` of summary.json), the filter's statistics and the history, if recorded.
+            An evaluation per block.
         """
         env = self.env
+        for block, seed in zip(env.blocks, seeds, strict=False):
+            block.generator.manual_seed(seed)
         td = env.reset()
-        alive = torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device)
-        charges = Charges.none(td[keys.ENERGY].squeeze(-1))
         kind = {"dtype": torch.float64, "device": env.device}
-        sums, least = torch.zeros(len(ADDED), **kind), torch.full((len(LEAST),), math.inf, **kind)
-        measured = Measured(alive, charges, sums, least)
-        restarts = torch.zeros((), dtype=torch.int64, device=env.device)
-        history = _History(env, every=math.ceil(steps / samples)) if record else None
+        measured = Measured(
+            torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device),
+            Charges.none(td[keys.ENERGY].squeeze(-1)),
+            torch.zeros(env.n_blocks, len(ADDED), **kind),
+            torch.full((env.n_blocks, len(LEAST)), math.inf, **kind),
+        )
+        restarts = torch.zeros(env.n_blocks, dtype=torch.int64, device=env.device)
+        every = math.ceil(steps / samples)
+        histories = [_History(env, block.worlds.start, every) for block in env.blocks] if record else []
         for k in range(steps):
             td = env.step(policy(td))
             alive, following = measured.alive, td["next"]
             measured = self._after(measured, td)
-            if history is not None:
+            for history in histories:
                 history.add(k, td, alive)
             if check is not None:
                 check(td, alive)
             ended, td = following["terminated"], step_mdp(td)
             if restart:
-                restarts += (ended & alive).sum()
+                restarts += (ended & alive).view(env.n_blocks, -1).sum(-1)
                 measured = measured._replace(alive=alive)
                 if ended.any():
                     td = env.reset(td.set("_reset", ended))
                     begun = measured.charges.restarted(td[keys.ENERGY].squeeze(-1), ended)
                     measured = measured._replace(charges=begun)
-        metrics, statistics = self._numbers(measured)
+        found = self._numbers(measured)
         if restart:
-            metrics["terminated_worlds"] = int(restarts)
-        return metrics, statistics, None if history is None else history.trajectory()
+            for (metrics, _), count in zip(found, restarts.tolist(), strict=True):
+                metrics["terminated_worlds"] = count
+        trajectories = [history.trajectory() for history in histories] or [None] * len(found)
+        return [Evaluation(*own, trajectory) for own, trajectory in zip(found, trajectories, strict=True)]
 
     def _after(self, measured: Measured, td: TensorDictBase) -> Measured:
         """With another transition taken in."""
@@ -145,31 +166,37 @@ class Evaluator:
         *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         """:class:`Measured` after a transition whose tensors are in the order of ``_keys``."""
-        config = self.env.config
         td = TensorDict(dict(zip(self._keys, tensors, strict=True)), alive.shape[:1])
-        following = td["next"]
+        following, blocks = td["next"], self.env.n_blocks
+        parts = zip(td.chunk(blocks), alive.chunk(blocks), strict=True)
+        added, now = (torch.stack(x) for x in zip(*(self._block_numbers(*part) for part in parts), strict=True))
+        # a margin that is not a number stays so; a barrier that is not a number is passed over
+        least = torch.cat([torch.minimum(least[:, :2], now[:, :2]), torch.fmin(least[:, 2:], now[:, 2:])], dim=-1)
         energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
+        charges = Charges(start, counted, count).after(energy, next_energy, alive, self.env.config)
+        return alive & ~following["terminated"], *charges, sums + added, least
+
+    def _block_numbers(self, td: TensorDictBase, alive: Tensor) -> tuple[Tensor, Tensor]:
+        """What a block's transition adds to its sums, and its own margins and barriers."""
+        config, following = self.env.config, td["next"]
+        next_energy = following[keys.ENERGY].squeeze(-1)
+        margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
+        gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
         found = {
             "worlds": alive.sum(),
             "cost": torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64),
             "powered": torch.where(alive, self._powered_cost(following), 0).sum(dtype=torch.float64),
             "reward": torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64),
+            "energy_margin": torch.where(alive, margin, math.inf).min(),
+            "distance_margin": torch.where(alive.squeeze(-1), gap, math.inf).min(),
+            **FilterStatistics(config.max_speed).numbers(td, alive),
         }
         for kind in keys.VIOLATION_KINDS:
             found[kind] = (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
-        margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
-        gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
-        found |= FilterStatistics(config.max_speed).numbers(td, alive)
-        found["energy_margin"] = torch.where(alive, margin, math.inf).min()
-        found["distance_margin"] = torch.where(alive.squeeze(-1), gap, math.inf).min()
         found["residual"] = -found["max_residual"]
-        absent = least.new_full((), math.inf)  # a barrier that the filter does not write
-        sums = sums + torch.stack([found[name].double() for name in ADDED])
-        now = torch.stack([found.get(name, absent).double() for name in LEAST])
-        # a margin that is not a number stays so; a barrier that is not a number is passed over
-        least = torch.cat([torch.minimum(least[:2], now[:2]), torch.fmin(least[2:], now[2:])])
-        charges = Charges(start, counted, count).after(energy, next_energy, alive, config)
-        return alive & ~following["terminated"], *charges, sums, least
+        absent = found["cost"].new_full((), math.inf)  # a barrier that the filter does not write
+        added = torch.stack([found[name].double() for name in ADDED])
+        return added, torch.stack([found.get(name, absent).double() for name in LEAST])
 
     def _powered_cost(self, state: TensorDictBase) -> Tensor:
         """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""
@@ -182,32 +209,38 @@ class Evaluator:
         cost = powered_coverage_cost(position, powered, *rest, diameter=self.env.config.diameter).unsqueeze(-1)
         return torch.where(powered.all(dim=-1, keepdim=True), state[keys.COVERAGE_COST], cost)
 
-    def _numbers(self, measured: Measured) -> tuple[dict, dict]:
-        """Metrics and the filter's statistics, read from the device."""
-        sums = dict(zip(ADDED, measured.sums.tolist(), strict=True))
-        least = dict(zip(LEAST, measured.least.tolist(), strict=True))
-        worlds = max(sums["worlds"], 1)
-        metrics = {
-            "coverage_cost": _finite(sums["cost"] / worlds),
-            "powered_coverage_cost": _finite(sums["powered"] / worlds),
-            "episode_reward": _finite(sums["reward"] / self.env.batch_size.numel()),
-            "violations": {kind: int(sums[kind]) for kind in keys.VIOLATION_KINDS},
-            "charges_per_robot": float(measured.charges.count.to(torch.float64).mean()),
-            "min_energy_margin": _finite(least["energy_margin"]),
-            "min_distance_margin": _finite(least["distance_margin"]),
-            "robot_steps": int(sums["worlds"]) * self.env.config.n_agents,
-            "terminated_worlds": int((~measured.alive).sum()),
-        }
-        statistics = FilterStatistics(self.env.config.max_speed)
-        statistics.add(sums | least | {"max_residual": -least["residual"]})
-        return metrics, statistics.summary()
+    def _numbers(self, measured: Measured) -> list[tuple[dict, dict]]:
+        """Metrics and the filter's statistics of every block, read from the device."""
+        config, blocks, found = self.env.config, self.env.n_blocks, []
+        charges = measured.charges.count.view(blocks, -1).to(torch.float64).mean(-1).tolist()
+        terminated = (~measured.alive).view(blocks, -1).sum(-1).tolist()
+        worlds_of_block = self.env.batch_size.numel() // blocks
+        for k, (added, extremes) in enumerate(zip(measured.sums.tolist(), measured.least.tolist(), strict=True)):
+            sums, least = dict(zip(ADDED, added, strict=True)), dict(zip(LEAST, extremes, strict=True))
+            worlds = max(sums["worlds"], 1)
+            metrics = {
+                "coverage_cost": _finite(sums["cost"] / worlds),
+                "powered_coverage_cost": _finite(sums["powered"] / worlds),
+                "episode_reward": _finite(sums["reward"] / worlds_of_block),
+                "violations": {kind: int(sums[kind]) for kind in keys.VIOLATION_KINDS},
+                "charges_per_robot": charges[k],
+                "min_energy_margin": _finite(least["energy_margin"]),
+                "min_distance_margin": _finite(least["distance_margin"]),
+                "robot_steps": int(sums["worlds"]) * config.n_agents,
+                "terminated_worlds": terminated[k],
+            }
+            statistics = FilterStatistics(config.max_speed)
+            statistics.add(sums | least | {"max_residual": -least["residual"]})
+            found.append((metrics, statistics.summary()))
+        return found
 
 
 def evaluate_policy(
     env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, **options: Any
 ) -> tuple[dict, dict, Trajectory | None]:
-    """A single rollout of :class:`Evaluator`, with its options."""
-    return Evaluator(env)(policy, steps, **options)
+    """A single rollout of :class:`Evaluator` in worlds of one seed, with its options."""
+    (found,) = Evaluator(env)(policy, steps, **options)
+    return found
 
 
 def evaluation_scalars(metrics: dict) -> dict[str, float]:
@@ -224,10 +257,10 @@ def _finite(value: float) -> float | None:
 
 
 class _History:
-    """History of the first world, every ``every``-th step until it ends, kept where the world is."""
+    """History of one world, every ``every``-th step until it ends, kept where the world is."""
 
-    def __init__(self, env: SurveillanceEnv, every: int) -> None:
-        self.env, self.every = env, every
+    def __init__(self, env: SurveillanceEnv, world: int, every: int) -> None:
+        self.env, self.world, self.every = env, world, every
         self.samples: dict[str, list[Tensor]] = {
             name: [] for name in ("alive", "position", "energy", "charging", "slot", "density", "coverage_cost")
         }
@@ -236,18 +269,20 @@ class _History:
         """Take in transition k (its next state)."""
         if k % self.every:
             return
-        following, density = td["next"], self.env.density
+        following, density, world = td["next"], self.env.density, self.world
         params = following.get(keys.DENSITY, None)
         rows = {
-            "alive": alive[0, 0],
-            "position": following[keys.POSITION][0],
-            "energy": following[keys.ENERGY][0, :, 0],
-            "charging": (following[keys.ENERGY] > td[keys.ENERGY])[0, :, 0],
-            "slot": following[keys.SLOT][0, :, 0],
-            "coverage_cost": following[keys.COVERAGE_COST][0, 0],
+            "alive": alive[world, 0],
+            "position": following[keys.POSITION][world],
+            "energy": following[keys.ENERGY][world, :, 0],
+            "charging": (following[keys.ENERGY] > td[keys.ENERGY])[world, :, 0],
+            "slot": following[keys.SLOT][world, :, 0],
+            "coverage_cost": following[keys.COVERAGE_COST][world, 0],
         }
         if density.n_params or not self.samples["density"]:
-            weights = density.weights(following[keys.POSITION].new_zeros(1, 0) if params is None else params[:1])
+            weights = density.weights(
+                following[keys.POSITION].new_zeros(1, 0) if params is None else params[world : world + 1]
+            )
             rows["density"] = weights.reshape(-1)
         for name, row in rows.items():
             self.samples[name].append(row.clone())

@@ -57,10 +57,7 @@ def check_violations(
     """
     if safety.mode != "certified":
         return
-    flags = [tensordict["next"][(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
-    flags = torch.stack([*flags, tensordict[keys.OUTSIDE]], -1)
-    if alive is not None:
-        flags = flags & alive.unsqueeze(-1)
+    flags = broken_promises(tensordict, alive)
     if not flags.any():
         return
     first = tuple(flags.flatten(-2).any(dim=-1).nonzero()[0].tolist())
@@ -71,6 +68,13 @@ def check_violations(
         f"{', '.join(kinds)} behind the certified filter, which must not happen: please report it. The state that caused it "
         f"is in {path}; agents.incident.replay computes the step again, a copy in tests/violations/ is tested from then on."
     )
+
+
+def broken_promises(tensordict: TensorDictBase, alive: Tensor | None = None) -> Tensor:
+    """Violations by kind and states outside the certified set, ``(*B, N, 5)``, of the arguments of :func:`check_violations`."""
+    flags = [tensordict["next"][(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
+    flags = torch.stack([*flags, tensordict[keys.OUTSIDE]], -1)
+    return flags if alive is None else flags & alive.unsqueeze(-1)
 
 
 def save_incident(path: Path, row: TensorDictBase, world: SurveillanceConfig, safety: SafetyConfig) -> Path:

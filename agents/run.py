@@ -13,11 +13,11 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from agents.board import Board
-from agents.checkpoint import CheckpointError, world_sizes
+from agents.checkpoint import CheckpointError
 from agents.collection import Block, WorkerBlock, seeds_of_streams
 from agents.divergence import DivergedError, check_batch, check_finite, check_weights
-from agents.evaluation import Evaluator, evaluation_scalars, rollout_steps
-from agents.incident import ViolationError, check_violations
+from agents.evaluation import Evaluation, Evaluator, evaluation_scalars, rollout_steps
+from agents.incident import ViolationError, broken_promises, check_violations
 from agents.learners import Learner
 from agents.noise import ExplorationNoise
 from agents.pipeline import WaitingSteps, draw, make_buffer, store
@@ -65,8 +65,7 @@ class TrainingRun:
         worlds: its worlds.
         waiting: its steps that wait for n-step transitions.
         noise: its exploration noise.
-        policy: deployment policy of its networks.
-        evaluator: rolls policies out, for all runs.
+        sizes: of the networks, by :func:`agents.checkpoint.world_sizes`.
         seconds: where the program's time goes.
     """
 
@@ -82,16 +81,15 @@ class TrainingRun:
         worlds: Block,
         waiting: WaitingSteps,
         noise: ExplorationNoise,
-        policy: TensorDictSequential,
-        evaluator: Evaluator,
+        sizes: dict,
         seconds: Seconds,
     ) -> None:
         self.folder, self.config, self.seed, self.origin, self.settings = folder, config, seed, origin, settings
-        self.worlds, self.learner, self.noise, self.policy, self.evaluator = worlds, learner, noise, policy, evaluator
+        self.worlds, self.learner, self.noise = worlds, learner, noise
         self.error: Exception | None = None
         """What ended the run before its time, where it shares its program with others."""
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
-        device, agent = evaluator.env.device, config.agent
+        device, agent = noise.generator.device, config.agent
         self.batch_size = config.buffer.batch_size * (config.env.n_agents if agent.minibatch == "per_agent" else 1)
         self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
@@ -104,7 +102,7 @@ class TrainingRun:
         parts = {"actor": learner.actor, "loss": learner.loss, "optimizers": learner.optimizers, "env": worlds}
         parts |= {"noise": noise, "multi_step": waiting, "recorder": self.recorder, "clocks": self.clocks}
         parts |= {"seconds": seconds}
-        made_for = {"config": settings, "world": world_sizes(evaluator.env)}
+        made_for = {"config": settings, "world": sizes}
         keep, with_buffer = config.checkpoint.keep, config.checkpoint.buffer
         self.state = TrainingState(folder, parts, self.buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
         self.check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
@@ -136,16 +134,11 @@ class TrainingRun:
         log, settings = self.config.log, self.settings | {"seed": self.seed}
         self.board = Board(self.folder, self.recorder.frames, settings, figures=log.figures, gif=log.gif)
 
-    def evaluate(self) -> None:
-        """Measure the deployment policy, from the same start states every time."""
-        self.evaluator.env.set_seed(self.eval_seed)
-        steps = self.config.eval.steps or rollout_steps(self.config.env.horizon)
-        metrics, statistics, trajectory = self.evaluator(
-            self.policy, steps, record=self.board.records, check=self.check
-        )
-        self.board.scalars(evaluation_scalars(metrics), self.recorder.frames)
-        self.board.world(trajectory, self.recorder.frames)
-        if self.recorder.evaluated(metrics | {"filter": statistics}):
+    def take_evaluation(self, found: Evaluation) -> None:
+        """Log what came of the policy's rollout; the best policy so far is kept."""
+        self.board.scalars(evaluation_scalars(found.metrics), self.recorder.frames)
+        self.board.world(found.trajectory, self.recorder.frames)
+        if self.recorder.evaluated(found.metrics | {"filter": found.statistics}):
             self.state.save_best()
 
     def take(self, counted: Counted, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
@@ -202,10 +195,10 @@ class TrainingRun:
         """Whether the last frame is collected."""
         return self.recorder.frames == self.config.collector.total_frames
 
-    def evaluate_when_due(self) -> None:
-        """Evaluate at the interval of ``eval``, and at the end."""
-        if self.clocks["evaluate"](self.recorder.frames) | self.ends:
-            self.evaluate()
+    @property
+    def evaluates(self) -> bool:
+        """Whether an evaluation is due, at the interval of ``eval`` and at the end; asking starts the next interval."""
+        return self.clocks["evaluate"](self.recorder.frames) | self.ends
 
     @property
     def saves(self) -> bool:
@@ -296,6 +289,30 @@ def for_each(runs: Sequence[TrainingRun], act: Callable[..., object], *arguments
             run.board.close()
     if all(run.error is not None for run in runs):
         check_seeds(runs)
+
+
+def evaluate(runs: Sequence[TrainingRun], evaluator: Evaluator, policy: TensorDictSequential) -> None:
+    """Measure the policies of all runs as one batch, each from its own start states, the same every time.
+
+    Args:
+        runs: the program's runs.
+        evaluator: with a block of worlds for each.
+        policy: the deployment policy of all learners.
+    """
+    config = runs[0].config
+
+    def check(td: TensorDictBase, alive: Tensor) -> None:
+        if config.safety.mode == "certified" and broken_promises(td, alive).any():
+            for_each(runs, lambda run, *own: run.check(*own), td.chunk(len(runs)), alive.chunk(len(runs)))
+
+    found = evaluator(
+        policy,
+        config.eval.steps or rollout_steps(config.env.horizon),
+        seeds=[run.eval_seed for run in runs],
+        record=runs[0].board.records,
+        check=check,
+    )
+    for_each(runs, TrainingRun.take_evaluation, found)
 
 
 def stopped_at(runs: Sequence[TrainingRun]) -> str:

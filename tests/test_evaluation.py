@@ -2,13 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import step_mdp
 
 from agents import make_controller
-from agents.evaluation import evaluate_policy
+from agents.evaluation import Evaluator, evaluate_policy
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -211,3 +212,18 @@ def test_restarted_worlds_go_on_counting():
     assert once["robot_steps"] < again["robot_steps"] == B * steps * N
     assert again["terminated_worlds"] == int(sum(ended.sum() for ended in seen)) > once["terminated_worlds"]
     assert sum(again["violations"].values()) > sum(once["violations"].values())
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "density"), [("charge_when_low", "certified", "moving"), ("flee", "none", "uniform")]
+)
+def test_the_worlds_of_several_seeds_are_evaluated_as_each_alone(name, mode, density):
+    world = SurveillanceConfig(density=density)
+    policy, seeds, options = policy_of(name, world, mode=mode), [5, 9, 2], {"record": True}
+    together = Evaluator(SurveillanceEnv(world, 3 * B, seed=[0, 0, 0]))(policy, 60, seeds=seeds, **options)
+    for seed, found in zip(seeds, together, strict=True):
+        alone = evaluate_policy(SurveillanceEnv(world, B, seed=seed), policy, 60, seeds=[seed], **options)
+        assert found.metrics == alone[0]
+        assert found.statistics == alone[1]
+        for field, value in vars(alone[2]).items():
+            assert np.array_equal(getattr(found.trajectory, field), value), field

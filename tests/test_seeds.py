@@ -11,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import train
 from agents.checkpoint import checkpoints, load_checkpoint, save_checkpoint
 from agents.config import AgentConfig
+from agents.incident import ViolationError
 from agents.learners import LearnerStack, make_learner, make_learners
 from agents.maddpg import clip_gradients, update_step
 from agents.networks import make_policies
@@ -93,10 +94,11 @@ def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(
     (first,) = runs.glob("*_seed0")
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
 
-    def take(self, batch, *others, real=TrainingRun.take):
+    def take(self, counted, batch, *others, real=TrainingRun.take):
         if self.seed == 2 and self.recorder.frames >= 128:
             batch["next"][keys.REWARD].fill_(torch.nan)
-        real(self, batch, *others)
+            counted = counted._replace(sums=counted.sums | {"finite": 0.0})
+        real(self, counted, batch, *others)
 
     monkeypatch.setattr(TrainingRun, "take", take)
     code, output = program(train.main, *QUIET, "n_seeds=4")
@@ -129,6 +131,23 @@ def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(
     tags = EventAccumulator(str(found[2].folder)).Reload().Tags()["scalars"]
     assert "eval/coverage_cost" in tags
     assert json.loads((found[2].folder / "summary.json").read_text())["seed"] == 2
+
+
+def test_a_violation_in_an_evaluation_ends_its_seed_alone(program, tmp_path, monkeypatch, alone):
+    def check(td, alive=None, *, world, safety, folder):
+        assert td.shape == (len(alive),) == (2,)  # its own block
+        if folder.name.endswith("_seed1"):
+            raise ViolationError("a robot ran empty")
+
+    monkeypatch.setattr("agents.run.check_violations", check)
+    monkeypatch.setattr("agents.run.broken_promises", lambda td, alive: alive)
+    code, output = program(train.main, *QUIET, "n_seeds=3")
+    assert code == 1
+    assert "1 of 3 seeds failed: 1." in output
+    assert "seed 1: a robot ran empty" in output
+    runs = tmp_path / "runs" / "smoke"
+    assert {path.parent.name[-1] for path in runs.glob("*_seed?/summary.json")} == {"0", "2"}
+    assert not differences(alone[0], compared(next(runs.glob("*_seed0"))))
 
 
 @pytest.mark.parametrize(

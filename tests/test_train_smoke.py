@@ -9,7 +9,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import evaluate
 import train
 from agents.incident import load_incident
-from agents.run import TrainingRun
 from envs import SurveillanceConfig, graphs
 from envs.inequalities import derived_quantities
 from tests.standin_recording import StandInRecording
@@ -225,7 +224,7 @@ def test_training_stops_at_a_broken_promise(program, tmp_path, monkeypatch, size
         return -0.19 * position / position.norm(dim=-1, keepdim=True).clamp_min(0.1), level, None
 
     monkeypatch.setattr("safety.filter.shield", broken)
-    monkeypatch.setattr(TrainingRun, "evaluate", lambda self: None)
+    monkeypatch.setattr(train, "evaluate", lambda *_: None)
     monkeypatch.setattr(graphs, "recorder_for", lambda tensor: StandInRecording)
     code, output = program(train.main, *TINY, *sizes, "collector.total_frames=4000")
     assert code == 1
