@@ -83,7 +83,6 @@ class Evaluator:
         self._measure = graphed(self._measure_tensors, enabled=cuda_graphs)
         self._keys: list[NestedKey] = []
 
-    @torch.no_grad()
     def __call__(
         self,
         policy: TensorDictModuleBase,
@@ -111,9 +110,30 @@ class Evaluator:
         Returns:
             An evaluation per block.
         """
-        env = self.env
+        env, every = self.env, math.ceil(steps / samples)
         for block, seed in zip(env.blocks, seeds, strict=False):
             block.generator.manual_seed(seed)
+        histories = [_History(env, block.worlds.start, every) for block in env.blocks] if record else []
+        with env.without_gradients():
+            measured, restarts = self._roll_out(policy, steps, histories, check, restart=restart)
+            found = self._numbers(measured)
+        if restart:
+            for (metrics, _), count in zip(found, restarts.tolist(), strict=True):
+                metrics["terminated_worlds"] = count
+        trajectories = [history.trajectory() for history in histories] or [None] * len(found)
+        return [Evaluation(*own, trajectory) for own, trajectory in zip(found, trajectories, strict=True)]
+
+    def _roll_out(
+        self,
+        policy: TensorDictModuleBase,
+        steps: int,
+        histories: Sequence["_History"],
+        check: Callable[[TensorDictBase, Tensor], None] | None,
+        *,
+        restart: bool,
+    ) -> tuple[Measured, Tensor]:
+        """What was measured, and how many worlds of each block were drawn anew, ``(seeds,)``."""
+        env = self.env
         td = env.reset()
         kind = {"dtype": torch.float64, "device": env.device}
         measured = Measured(
@@ -123,8 +143,6 @@ class Evaluator:
             torch.full((env.n_blocks, len(LEAST)), math.inf, **kind),
         )
         restarts = torch.zeros(env.n_blocks, dtype=torch.int64, device=env.device)
-        every = math.ceil(steps / samples)
-        histories = [_History(env, block.worlds.start, every) for block in env.blocks] if record else []
         for k in range(steps):
             td = env.step(policy(td))
             alive, following = measured.alive, td["next"]
@@ -141,12 +159,7 @@ class Evaluator:
                     td = env.reset(td.set("_reset", ended))
                     begun = measured.charges.restarted(td[keys.ENERGY].squeeze(-1), ended)
                     measured = measured._replace(charges=begun)
-        found = self._numbers(measured)
-        if restart:
-            for (metrics, _), count in zip(found, restarts.tolist(), strict=True):
-                metrics["terminated_worlds"] = count
-        trajectories = [history.trajectory() for history in histories] or [None] * len(found)
-        return [Evaluation(*own, trajectory) for own, trajectory in zip(found, trajectories, strict=True)]
+        return measured, restarts
 
     def _after(self, measured: Measured, td: TensorDictBase) -> Measured:
         """With another transition taken in."""

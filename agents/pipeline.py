@@ -73,6 +73,15 @@ def use_threads(threads: int, *, deterministic: bool = False) -> None:
     torch.use_deterministic_algorithms(deterministic)
 
 
+class InferenceCollector(Collector):
+    """TorchRL's collector, in :meth:`SurveillanceEnv.without_gradients`. Its batches are ordinary tensors."""
+
+    def rollout(self) -> TensorDictBase:
+        """As TorchRL's."""
+        with self.env.without_gradients():
+            return super().rollout()
+
+
 def collect(
     env: SurveillanceEnv, policy: TensorDictModuleBase, frames_per_batch: int, frames: int, *, resumed: bool = False
 ) -> Generator[TensorDictBase, None, None]:
@@ -90,7 +99,7 @@ def collect(
     if not frames:  # a run that was stopped after its last batch
         return
     noise_state = policy.state_dict()
-    collector = Collector(
+    collector = InferenceCollector(
         env,
         policy,
         frames_per_batch=frames_per_batch,

@@ -133,7 +133,7 @@ class BatchCounter:
         self._count = graphed(self._count_tensors, enabled=cuda_graphs)
         self._keys: list[NestedKey] = []
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def __call__(self, batch: TensorDictBase) -> list[Counted]:
         """``(n_learners * num_envs, T)``: what each learner's worlds hold."""
         self._keys = self._keys or [key for key in COUNTED if key in batch.keys(True)]

@@ -14,12 +14,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.collectors import Collector
 
 from agents.config import AgentConfig
 from agents.networks import make_actor, make_policies
 from agents.noise import noises_of
-from agents.pipeline import COLLECTOR_OPTIONS, flat, use_threads
+from agents.pipeline import COLLECTOR_OPTIONS, InferenceCollector, flat, use_threads
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig
 
@@ -57,7 +56,7 @@ class WorkerTask:
     deterministic: bool = False
 
 
-class WorldsCollector(Collector):
+class WorldsCollector(InferenceCollector):
     """TorchRL's collector in a worker, built at the first batch: an error then reaches the learner as what it is, while Ray takes
     one of a constructor for a dead worker.
 
