@@ -12,7 +12,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
 from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
-from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.pipeline import MultiStep, collect, draw, make_buffer, store, to_transitions
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -564,6 +564,26 @@ def test_violation_penalty_is_charged_to_the_violator():
     expected[1, 2, 0] = -11.0
     assert torch.equal(got, expected)
     assert (to_transitions(batch)["next"][keys.REWARD] == -1).all()
+
+
+@pytest.mark.parametrize("compile_functions", [False, True])
+def test_where_rollouts_are_computed(compile_functions):
+    env = SurveillanceEnv(SurveillanceConfig(), 2, compile_functions=compile_functions)
+    with env.without_gradients():
+        assert not torch.is_grad_enabled()
+        assert torch.is_inference_mode_enabled() == (not compile_functions)
+
+
+def test_collected_batches_are_for_gradients_too():
+    s = Setup()
+    env = SurveillanceEnv(s.world, 4)
+    _, explore = make_policies(s.actor, s.world, s.safety, s.agent, 0, torch.device("cpu"))
+    for batch in collect(env, explore, 8, 32):
+        assert env.state["position"].is_inference()
+        assert not any(value.is_inference() for value in batch.values(True, True))
+    s.loss(to_transitions(batch).reshape(-1))["loss_value"].sum().backward()
+    assert all(p.grad is not None for p in s.loss.value_network_params.values(True, True))
+    assert not env.reset()[keys.OBSERVATION].is_inference()
 
 
 def test_buffer_samples_by_its_own_seed():
