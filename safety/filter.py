@@ -43,8 +43,9 @@ from safety.certificate import HOLD, HOMING, outside, pair_minimum, shield
 from safety.certified_rows import Rows, certified_rows
 from safety.config import SafetyConfig
 from safety.dalal import DalalLayer
-from safety.qp import QPStatus, project_halfspaces_ball, solve_qp
-from safety.speed_faces import face_normals, joint_rows
+from safety.programs import joint_solver, solve_jointly, solve_per_robot
+from safety.qp import QPStatus, solve_qp
+from safety.speed_faces import joint_rows
 
 
 class SafetyFilter(TensorDictModuleBase):
@@ -96,7 +97,6 @@ class SafetyFilter(TensorDictModuleBase):
         self.gains = safety.gains(world)
         self.literal = literal_geometry(world)
         self.geometry = world.homing
-        self._joint_solver = "active_set" if safety.solver in ("auto", "exact") else safety.solver
         self.in_keys = [keys.NOMINAL_ACTION, keys.POSITION, keys.ENERGY, keys.SLOT]
         self.out_keys = [
             *(keys.ACTION, keys.CHARGE_CURRENT, keys.CORRECTION, keys.STATUS, keys.LEVEL, keys.RESIDUAL),
@@ -260,7 +260,8 @@ class SafetyFilter(TensorDictModuleBase):
         bound_s = torch.where(active_s, alpha_s * h_s.value, torch.inf)
         gain_s = -h_s.velocity_gain
         if self.safety.split == "joint":
-            action, status, residual = self._solve_joint(target, gain_c, bound_c, gain_s, bound_s)
+            rows = (gain_c, bound_c, gain_s, bound_s, self.world.max_speed)
+            action, status, residual = solve_jointly(target, *rows, self.safety.solver)
         else:
             share = 1.0 if self.safety.split == "full" else 0.5
             G = torch.cat([gain_c.unsqueeze(-2), without_self(gain_s)], dim=-2)
@@ -285,38 +286,8 @@ class SafetyFilter(TensorDictModuleBase):
         return action.view(m, n, d), status.view(m, n), residual.view(m, n)
 
     def _solve_per_robot(self, target: Tensor, G: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One problem per robot: ``target (*B, d)``, ``G (*B, m, d)``, ``h (*B, m)``."""
-        radius = self.world.max_speed
-        if self.safety.solver not in ("auto", "exact"):
-            faces, offset = face_normals(target.shape[-1], radius, target.dtype, target.device)
-            G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)
-            h = torch.cat([h, h.new_full((*h.shape[:-1], len(faces)), offset)], dim=-1)
-            identity = torch.eye(target.shape[-1], dtype=target.dtype, device=target.device)
-            solution = solve_qp(identity, -target, G, h, solver=self.safety.solver)
-        else:
-            # half of limit_speed's hair: cut targets stay as they are, and rounding stays inside the ball
-            solution = project_halfspaces_ball(target, G, h, radius * (1 - 5e-7), fixed_sizes=self.fixed_sizes)
-        return solution.value, solution.status, solution.residual
-
-    def _solve_joint(
-        self, target: Tensor, gain_c: Tensor, bound_c: Tensor, gain_s: Tensor, bound_s: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """One problem per world over all N d velocities; its status and residual are every robot's."""
-        n, d = target.shape[-2:]
-        G, h = joint_rows(gain_c, bound_c, gain_s, bound_s, self.world.max_speed)
-        identity = torch.eye(n * d, dtype=target.dtype, device=target.device)
-        if target.requires_grad:
-            # robot i's gradient flows through its own nominal action only: N copies, the neighbours' detached
-            own = torch.eye(n, dtype=torch.bool, device=target.device).unsqueeze(-1)
-            nominal = torch.where(own, target.unsqueeze(-3), target.detach().unsqueeze(-3)).flatten(-2)
-            solution = solve_qp(identity, -nominal, G.unsqueeze(-3), h.unsqueeze(-2), solver=self._joint_solver)
-            diagonal = torch.arange(n, device=target.device)
-            action = solution.value.unflatten(-1, (n, d))[..., diagonal, diagonal, :]
-            return action, solution.status, solution.residual
-        solution = solve_qp(identity, -target.flatten(-2), G, h, solver=self._joint_solver)
-        shape = target.shape[:-1]
-        action = solution.value.unflatten(-1, (n, d))
-        return action, solution.status.unsqueeze(-1).expand(shape), solution.residual.unsqueeze(-1).expand(shape)
+        settings = (self.world.max_speed, self.safety.solver)
+        return solve_per_robot(target, G, h, *settings, fixed_sizes=self.fixed_sizes)
 
     def solve_task(self, Q: Tensor, p: Tensor, position: Tensor, energy: Tensor, slot: Tensor) -> Tensor:
         """Joint quadratic program of a task controller under this filter's rows; hold where it cannot be solved.
@@ -337,7 +308,7 @@ class SafetyFilter(TensorDictModuleBase):
         bound_c = h_c.drift + h_c.current_gain * current + alpha_c * h_c.value
         gains = (-h_c.velocity_gain, bound_c, -h_s.velocity_gain, alpha_s * h_s.value)
         G, h = joint_rows(*gains, self.world.max_speed)
-        solution = solve_qp(Q, p, G, h, solver=self._joint_solver)
+        solution = solve_qp(Q, p, G, h, solver=joint_solver(self.safety.solver))
         solved = (solution.status == QPStatus.SOLVED).unsqueeze(-1)
         return torch.where(solved, solution.value, 0.0).unflatten(-1, position.shape[-2:])
 
