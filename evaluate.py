@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from agents import make_controller
 from agents.checkpoint import find_checkpoint, load_checkpoint
-from agents.evaluation import Evaluator, rollout_steps
+from agents.evaluation import evaluate_policy, rollout_steps
 from agents.incident import check_violations
 from agents.networks import make_actor
 from agents.pipeline import pick_device, use_threads
@@ -82,10 +82,8 @@ def main(cfg: DictConfig) -> None:
     announce_certificate(folder, world)
     check = functools.partial(check_violations, world=world, safety=safety, folder=folder)
     start = time.perf_counter()
-    (found,) = Evaluator(env, cuda_graphs=config.cuda_graphs)(
-        policy, steps, record=config.pictures, samples=config.samples, restart=config.restart, check=check
-    )
-    metrics, statistics, trajectory = found
+    options = {"record": config.pictures, "samples": config.samples, "restart": config.restart, "check": check}
+    metrics, statistics, trajectory = evaluate_policy(env, policy, steps, cuda_graphs=config.cuda_graphs, **options)
     content = {
         **metrics,
         "filter": statistics,

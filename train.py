@@ -13,6 +13,7 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents.checkpoint import world_sizes
@@ -20,14 +21,13 @@ from agents.collection import make_collection, seeds_of_streams
 from agents.evaluation import Evaluator
 from agents.interruption import StopSignals
 from agents.learners import make_learners, make_update
-from agents.networks import make_policies
+from agents.networks import acting, actor_of_blocks, make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import BatchCounter, Seconds
-from agents.run import (
-    FAILURES,
+from agents.run import FAILURES, TrainingRun
+from agents.seeds import (
     SeedsFailedError,
-    TrainingRun,
     check_seeds,
     equally_far,
     errors_by_seed,
@@ -88,7 +88,9 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     )
     update = make_update(learner, config.agent, safety, **graphs)
     modules = (learner.actor, world, safety, config.agent)
-    policy, explore_policy = make_policies(*modules, noise_seeds, device, **config.computing)
+    _, explore_policy = make_policies(*modules, noise_seeds, device, **config.computing)
+    deployed = acting(actor_of_blocks([own.actor for own in learners]), **graphs)
+    policy = TensorDictSequential(deployed, explore_policy[-1])
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
@@ -104,6 +106,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             waiting=multi_step.blocks[k],
             noise=noises[k],
             sizes=world_sizes(eval_env),
+            device=device,
             seconds=seconds,
         )
         for k, (seed, folder) in enumerate(folders.items())

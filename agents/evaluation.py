@@ -1,4 +1,4 @@
-"""Deterministic rollouts of a policy in many worlds, measured as they run (nothing is stored but one world's history)."""
+"""Deterministic rollouts of policies in many worlds, measured as they run (nothing is stored but one world's history a seed)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from envs.coverage import powered_coverage_cost
 from envs.graphs import graphed
 from envs.metrics import Charges, minimum_distance
 from envs.rendering import Trajectory
-from safety.statistics import MARGINS, SUMS, FilterStatistics
+from safety.statistics import MARGINS, SUMS, FilterStatistics, filter_numbers
 
 RECORD_LIMIT = 2000  # samples of the recorded world by default; longer rollouts keep every n-th
 
@@ -36,8 +36,9 @@ READ: list[NestedKey] = [
         keys.OUTSIDE,
         *MARGINS.values(),
     ),
-    *(("next", key) for key in (keys.POSITION, keys.ENERGY, keys.COVERAGE_COST, keys.DENSITY, "terminated")),
-    *(("next", *key) for key in (keys.REWARD, *((*keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS))),
+    *(("next", *key) for key in (keys.POSITION, keys.ENERGY, keys.REWARD)),
+    *(("next", key) for key in (keys.COVERAGE_COST, keys.DENSITY, "terminated")),
+    *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),
 ]
 """What is measured of a transition."""
 ADDED = ("worlds", "cost", "powered", "reward", *keys.VIOLATION_KINDS, *SUMS)
@@ -110,10 +111,12 @@ class Evaluator:
         Returns:
             An evaluation per block.
         """
-        env, every = self.env, math.ceil(steps / samples)
-        for block, seed in zip(env.blocks, seeds, strict=False):
+        env = self.env
+        for block, seed in zip(env.blocks, seeds, strict=bool(seeds)):
             block.generator.manual_seed(seed)
-        histories = [_History(env, block.worlds.start, every) for block in env.blocks] if record else []
+        histories = []
+        if record:
+            histories = [_History(env, block.worlds.start, math.ceil(steps / samples)) for block in env.blocks]
         with env.without_gradients():
             measured, restarts = self._roll_out(policy, steps, histories, check, restart=restart)
             found = self._numbers(measured)
@@ -135,12 +138,12 @@ class Evaluator:
         """What was measured, and how many worlds of each block were drawn anew, ``(seeds,)``."""
         env = self.env
         td = env.reset()
-        kind = {"dtype": torch.float64, "device": env.device}
+        factory = {"dtype": torch.float64, "device": env.device}
         measured = Measured(
             torch.ones(*env.batch_size, 1, dtype=torch.bool, device=env.device),
             Charges.none(td[keys.ENERGY].squeeze(-1)),
-            torch.zeros(env.n_blocks, len(ADDED), **kind),
-            torch.full((env.n_blocks, len(LEAST)), math.inf, **kind),
+            torch.zeros(env.n_blocks, len(ADDED), **factory),
+            torch.full((env.n_blocks, len(LEAST)), math.inf, **factory),
         )
         restarts = torch.zeros(env.n_blocks, dtype=torch.int64, device=env.device)
         for k in range(steps):
@@ -181,28 +184,33 @@ class Evaluator:
         """:class:`Measured` after a transition whose tensors are in the order of ``_keys``."""
         td = TensorDict(dict(zip(self._keys, tensors, strict=True)), alive.shape[:1])
         following, blocks = td["next"], self.env.n_blocks
+        # a recording does not ask; where it is known that all have power, their cost is the coverage cost
+        powered = not self.recorded and bool((following[keys.ENERGY] >= self.env.config.energy_min).all())
         parts = zip(td.chunk(blocks), alive.chunk(blocks), strict=True)
-        added, now = (torch.stack(x) for x in zip(*(self._block_numbers(*part) for part in parts), strict=True))
+        numbers = [self._block_numbers(*part, all_powered=powered) for part in parts]
+        added, now = (torch.stack(x) for x in zip(*numbers, strict=True))
         # a margin that is not a number stays so; a barrier that is not a number is passed over
         least = torch.cat([torch.minimum(least[:, :2], now[:, :2]), torch.fmin(least[:, 2:], now[:, 2:])], dim=-1)
         energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
         charges = Charges(start, counted, count).after(energy, next_energy, alive, self.env.config)
         return alive & ~following["terminated"], *charges, sums + added, least
 
-    def _block_numbers(self, td: TensorDictBase, alive: Tensor) -> tuple[Tensor, Tensor]:
+    def _block_numbers(self, td: TensorDictBase, alive: Tensor, *, all_powered: bool) -> tuple[Tensor, Tensor]:
         """What a block's transition adds to its sums, and its own margins and barriers."""
         config, following = self.env.config, td["next"]
+        cost = following[keys.COVERAGE_COST]
+        powered_cost = cost if all_powered else self._powered_cost(following)
         next_energy = following[keys.ENERGY].squeeze(-1)
         margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
         gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
         found = {
             "worlds": alive.sum(),
-            "cost": torch.where(alive, following[keys.COVERAGE_COST], 0).sum(dtype=torch.float64),
-            "powered": torch.where(alive, self._powered_cost(following), 0).sum(dtype=torch.float64),
+            "cost": torch.where(alive, cost, 0).sum(dtype=torch.float64),
+            "powered": torch.where(alive, powered_cost, 0).sum(dtype=torch.float64),
             "reward": torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64),
             "energy_margin": torch.where(alive, margin, math.inf).min(),
             "distance_margin": torch.where(alive.squeeze(-1), gap, math.inf).min(),
-            **FilterStatistics(config.max_speed).numbers(td, alive),
+            **filter_numbers(td, config.max_speed, alive),
         }
         for kind in keys.VIOLATION_KINDS:
             found[kind] = (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
@@ -214,8 +222,6 @@ class Evaluator:
     def _powered_cost(self, state: TensorDictBase) -> Tensor:
         """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""
         powered = (state[keys.ENERGY] >= self.env.config.energy_min).squeeze(-1)
-        if not self.recorded and powered.all():
-            return state[keys.COVERAGE_COST]
         density, position = self.env.density, state[keys.POSITION]
         params = state[keys.DENSITY] if density.n_params else position.new_zeros(len(position), 0)
         rest = (density.points, density.weights(params), density.cell_moment)
@@ -242,22 +248,22 @@ class Evaluator:
                 "robot_steps": int(sums["worlds"]) * config.n_agents,
                 "terminated_worlds": terminated[k],
             }
-            statistics = FilterStatistics(config.max_speed)
+            statistics = FilterStatistics()
             statistics.add(sums | least | {"max_residual": -least["residual"]})
             found.append((metrics, statistics.summary()))
         return found
 
 
 def evaluate_policy(
-    env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, **options: Any
-) -> tuple[dict, dict, Trajectory | None]:
-    """A single rollout of :class:`Evaluator` in worlds of one seed, with its options."""
-    (found,) = Evaluator(env)(policy, steps, **options)
+    env: SurveillanceEnv, policy: TensorDictModuleBase, steps: int, *, cuda_graphs: bool = False, **options: Any
+) -> Evaluation:
+    """A single rollout in worlds of one seed: :class:`Evaluator` and its options."""
+    (found,) = Evaluator(env, cuda_graphs=cuda_graphs)(policy, steps, **options)
     return found
 
 
 def evaluation_scalars(metrics: dict) -> dict[str, float]:
-    """The numbers of :func:`evaluate_policy`'s metrics by TensorBoard tag."""
+    """The numbers of an evaluation's metrics by TensorBoard tag."""
     scalars: dict[str, float] = {
         f"eval/{name}": value for name, value in metrics.items() if isinstance(value, int | float)
     }

@@ -1,7 +1,7 @@
 """One learner per seed, or several updated as one batch.
 
 The tensors of stacked learners are slices of larger ones: every learner keeps modules of its own, whose parameters share
-memory with the stack's, so that evaluation and checkpoints see single learners and one update serves all. Nothing is added
+memory with the stack's, so that checkpoints and evaluations see single learners and one update serves all. Nothing is added
 up across learners. On a CPU each comes out as it would alone, to the bit, where the matrix products of a batch have the bits
 of single ones: so with the default's layers and robots; not with one robot, in float64 or with layers of odd sizes, where
 it is to rounding.

@@ -1,5 +1,7 @@
 """Actors and critics of all robots, each evaluated in one batched call, and the policies made of them."""
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -225,6 +227,31 @@ def make_critic(
         TensorDictModule(join, in_keys=[keys.ACTION], out_keys=[JOINT_ACTION]),
         TensorDictModule(critic, in_keys=[keys.OBSERVATION, JOINT_ACTION], out_keys=[STATE_ACTION_VALUE]),
     )
+
+
+class ActorsOfBlocks(nn.Module):
+    """Policy networks of several learners, each for its block of the worlds: the bits that it has alone, however few worlds.
+
+    Args:
+        parts: the networks of each.
+    """
+
+    def __init__(self, parts: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(parts)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``(B, N, n_obs) -> (B, N, d)``, m/s."""
+        blocks = observation.chunk(len(self.parts))  # copied: matrix products round by where their rows lie
+        return torch.cat([part(block.clone()) for part, block in zip(self.parts, blocks, strict=True)])
+
+
+def actor_of_blocks(actors: Sequence[TensorDictModule]) -> TensorDictModule:
+    """The actors of several learners as one, each for its block of the worlds; a single one as it is."""
+    if len(actors) == 1:
+        return actors[0]
+    whole = ActorsOfBlocks([actor.module for actor in actors])
+    return TensorDictModule(whole, in_keys=[keys.OBSERVATION], out_keys=[keys.NOMINAL_ACTION])
 
 
 def acting(actor: TensorDictModuleBase, *, cuda_graphs: bool) -> TensorDictModuleBase:

@@ -1,7 +1,5 @@
 """Exploration noise on nominal actions, before the filter: of one learner, or of several, each on its block of the worlds."""
 
-import functools
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -9,6 +7,7 @@ from torch import Tensor, nn
 
 from agents.config import AgentConfig
 from envs import SurveillanceConfig, keys
+from envs.dynamics import constant
 from envs.randomness import restore_generator
 
 
@@ -103,9 +102,9 @@ def explore(parts: list[ExplorationNoise], tensordict: TensorDictBase) -> Tensor
         keep = 1 - first.agent.ou_theta
         noise = noise * (1 - keep**2) ** 0.5
         before = [part.process for part in parts if part.process is not None]
-        if sum(len(block) for block in before) == len(noise):
-            before = before[0] if len(before) == 1 else torch.cat(before)
-            noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, before)
+        if len(before) == len(parts) and before[0].shape == noise.chunk(len(parts))[0].shape:
+            whole = before[0] if len(before) == 1 else torch.cat(before)
+            noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, whole)
         for part, block in zip(parts, noise.chunk(len(parts)), strict=True):
             part.process = block
     spread = spread_of_worlds(
@@ -117,7 +116,7 @@ def explore(parts: list[ExplorationNoise], tensordict: TensorDictBase) -> Tensor
     return tensordict.set(keys.NOMINAL_ACTION, action + size * noise)
 
 
-@functools.lru_cache(maxsize=16)
+@constant
 def spread_of_worlds(worlds: int, copies: int, noise_spread: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Share of sigma for each world, evenly over ``[1 - noise_spread, 1]``, of so many blocks, ``(copies * worlds, 1, 1)``."""
     rank = torch.arange(1, worlds + 1, dtype=dtype, device=device) / worlds

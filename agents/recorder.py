@@ -12,7 +12,7 @@ from agents.divergence import WATCHED
 from envs import SurveillanceConfig, keys
 from envs.graphs import graphed
 from envs.metrics import EpisodeTracker
-from safety.statistics import MARGINS, FilterStatistics
+from safety.statistics import MARGINS, FilterStatistics, filter_numbers
 
 COUNTED: list[NestedKey] = [
     *(*WATCHED.values(), keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE, *MARGINS.values()),
@@ -128,8 +128,7 @@ class BatchCounter:
     """
 
     def __init__(self, world: SurveillanceConfig, n_learners: int = 1, *, cuda_graphs: bool = False) -> None:
-        self.filter = FilterStatistics(world.max_speed)
-        self.n_learners = n_learners
+        self.world, self.n_learners = world, n_learners
         self._count = graphed(self._count_tensors, enabled=cuda_graphs)
         self._keys: list[NestedKey] = []
 
@@ -157,11 +156,10 @@ class BatchCounter:
         found["done"] = following["done"].any().double()
         # finite only if all terms are; an overflow is looked at more closely
         found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
-        found |= self.filter.numbers(batch)
+        found |= filter_numbers(batch, self.world.max_speed)
         self._names = list(found)
-        return torch.stack(list(found.values())), torch.stack(flags).any(dim=0).sum(
-            -1
-        )  # a robot may violate twice at once
+        violating = torch.stack(flags).any(dim=0).sum(-1)  # a robot may violate twice at once
+        return torch.stack(list(found.values())), violating
 
 
 class TrainingRecorder:
@@ -178,8 +176,8 @@ class TrainingRecorder:
         self.frames = 0
         self.violations = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.episodes = EpisodeTracker(num_envs, device)
-        self.filter = FilterStatistics(world.max_speed)
-        self._recent = FilterStatistics(world.max_speed)
+        self.filter = FilterStatistics()
+        self._recent = FilterStatistics()
         self._cost = [0.0, 0]
         self._violations_recent = dict.fromkeys(keys.VIOLATION_KINDS, 0)
         self.evaluation: dict = {}
@@ -235,7 +233,7 @@ class TrainingRecorder:
         if returns:
             scalars["train/return"] = sum(returns) / len(returns)
             scalars["train/violations_per_episode"] = sum(counts) / len(counts)
-        self._recent = FilterStatistics(self.world.max_speed)
+        self._recent = FilterStatistics()
         self._cost, self._violations_recent = [0.0, 0], dict.fromkeys(keys.VIOLATION_KINDS, 0)
         return scalars
 

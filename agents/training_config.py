@@ -137,7 +137,7 @@ class EvalConfig:
     interval_frames: int = 100_000
     """World-steps between evaluations during training, >= 0 (0 = only at the end)."""
     num_envs: int = 64
-    """Worlds of an evaluation, 1..1e6."""
+    """Worlds of a seed's evaluation, 1..1e6."""
     steps: int = 0
     """Length of an evaluation; 0 = the world's horizon (1000 where it has none)."""
 

@@ -20,7 +20,7 @@ from agents.divergence import DivergedError
 from agents.incident import ViolationError
 from agents.interruption import InterruptedRunError, sweep_stops
 from agents.report_runs import ReportError
-from agents.run import SeedsFailedError
+from agents.seeds import SeedsFailedError
 from conf.command_line import fail, wants_traceback
 from conf.job_log import FAILED, LOG, JobLog, keep_failure
 from conf.run_folder import BusyFolderError, finished_program, only_writer

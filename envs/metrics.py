@@ -48,6 +48,7 @@ def violations(
 
 
 @functools.cache  # for good, as a recording knows them by their addresses
+@torch.inference_mode(mode=False)
 def _made_pairs(n_agents: int, device: torch.device) -> tuple[Tensor, Tensor]:
     i, j = torch.triu_indices(n_agents, n_agents, offset=1, device=device)
     return i, j

@@ -21,53 +21,15 @@ SUMS = ("robot_steps", "interventions", "correction", "fallbacks", "infeasible",
 
 
 class FilterStatistics:
-    """Running sums over filtered robot-steps.
+    """Running sums over filtered robot-steps."""
 
-    Args:
-        max_speed: unit of the intervention threshold, m/s.
-    """
-
-    def __init__(self, max_speed: float) -> None:
-        self.max_speed = max_speed
+    def __init__(self) -> None:
         self.sums = dict.fromkeys(SUMS, 0.0)
         self.max_residual = 0.0
         self.least: dict[str, float] = {}
 
-    def update(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> None:
-        """Take in filter outputs of any batch shape.
-
-        Args:
-            tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``.
-            alive: ``(*B, 1)`` bool, worlds that count; all if not given.
-        """
-        found = self.numbers(tensordict, alive)
-        self.add(dict(zip(found, torch.stack(list(found.values())).tolist(), strict=True)))
-
-    def numbers(self, tensordict: TensorDictBase, alive: Tensor | None = None) -> dict[str, Tensor]:
-        """What :meth:`add` takes, of :meth:`update`'s arguments, each ``()`` float64: the device is not waited for."""
-        status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
-        correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
-        counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
-        rows = (
-            counts,
-            counts & (correction > 1e-6 * self.max_speed),
-            torch.where(counts, correction, 0.0),
-            counts & (level > 0),
-            counts & (status == QPStatus.INFEASIBLE),
-            counts & (status == QPStatus.INACCURATE),
-            counts & tensordict[keys.OUTSIDE],
-            counts & (level == HOMING),
-        )
-        found: dict[str, Tensor] = dict(zip(SUMS, (row.sum(dtype=torch.float64) for row in rows), strict=True))
-        found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
-        margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
-        for name, x in margins.items():
-            if x is not None:
-                found[name] = torch.where(counts, x.squeeze(-1), torch.inf).min().double()
-        return found
-
     def add(self, found: dict[str, float]) -> None:
-        """Add what was read of :meth:`numbers`."""
+        """Add what was read of :func:`filter_numbers`."""
         for name in SUMS:
             self.sums[name] += found[name]
         self.max_residual = max(self.max_residual, found["max_residual"])
@@ -100,3 +62,33 @@ class FilterStatistics:
         """Restore what :meth:`state_dict` returned."""
         self.sums, self.least = dict(state["sums"]), dict(state["least"])
         self.max_residual = state["max_residual"]
+
+
+def filter_numbers(tensordict: TensorDictBase, max_speed: float, alive: Tensor | None = None) -> dict[str, Tensor]:
+    """What :meth:`FilterStatistics.add` takes, each ``()`` float64: the device is not waited for.
+
+    Args:
+        tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``, of any batch shape.
+        max_speed: unit of the intervention threshold, m/s.
+        alive: ``(*B, 1)`` bool, worlds that count; all if not given.
+    """
+    status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
+    correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
+    counts = torch.ones_like(status, dtype=torch.bool) if alive is None else alive.expand(status.shape)
+    rows = (
+        counts,
+        counts & (correction > 1e-6 * max_speed),
+        torch.where(counts, correction, 0.0),
+        counts & (level > 0),
+        counts & (status == QPStatus.INFEASIBLE),
+        counts & (status == QPStatus.INACCURATE),
+        counts & tensordict[keys.OUTSIDE],
+        counts & (level == HOMING),
+    )
+    found: dict[str, Tensor] = dict(zip(SUMS, (row.sum(dtype=torch.float64) for row in rows), strict=True))
+    found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
+    margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
+    for name, x in margins.items():
+        if x is not None:
+            found[name] = torch.where(counts, x.squeeze(-1), torch.inf).min().double()
+    return found

@@ -20,6 +20,15 @@ def by_mask(func, args) -> bool:
     return func.overloadpacket in INDEXED and any(index is not None and index.dtype == torch.bool for index in args[1])
 
 
+def in_parts(mode, func, args, kwargs):
+    """The result of an operation made of others, which ``mode`` then sees one by one; NotImplemented for any other.
+
+    In inference mode PyTorch shows such operations to a mode as they are.
+    """
+    with mode:
+        return func.decompose(*args, **(kwargs or {}))
+
+
 class StandInRecording(TorchDispatchMode):
     """As :class:`envs.graphs.CudaRecording`, on any device.
 
@@ -40,6 +49,8 @@ class StandInRecording(TorchDispatchMode):
         StandInRecording.made += 1
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if (parts := in_parts(self, func, args, kwargs)) is not NotImplemented:
+            return parts
         packet = func.overloadpacket
         refused = packet in NOT_RECORDABLE or (packet not in INDEXED and TAGS & set(func.tags))
         if refused or by_mask(func, args):

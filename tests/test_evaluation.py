@@ -214,6 +214,29 @@ def test_restarted_worlds_go_on_counting():
     assert sum(again["violations"].values()) > sum(once["violations"].values())
 
 
+def test_what_is_not_a_number():
+    """Margins of NaN are none at all, barriers those of the states that had some."""
+    world = SurveillanceConfig(on_violation="continue")
+    policy = TensorDictSequential(make_controller("lloyd", world), SafetyFilter(SafetyConfig(mode="none"), world))
+    env, calls = SurveillanceEnv(world, B, seed=5), []
+
+    def wild(td):
+        calls.append(0)
+        td = policy(td)
+        return td.set(keys.ACTION, td[keys.ACTION] * (math.nan if len(calls) == 3 else 1.0))
+
+    metrics, statistics, _ = evaluate_policy(env, wild, 6)
+    assert metrics["min_distance_margin"] is metrics["coverage_cost"] is None
+    assert metrics["violations"]["collision"] > 0
+    assert math.isfinite(statistics["min_h_s"])
+
+
+def test_as_many_seeds_as_blocks():
+    for seeds in ([1], [1, 2, 3]):
+        with pytest.raises(ValueError, match="zip"):
+            Evaluator(SurveillanceEnv(num_envs=4, seed=[0, 0]))(lambda td: td, 1, seeds=seeds)
+
+
 @pytest.mark.parametrize(
     ("name", "mode", "density"), [("charge_when_low", "certified", "moving"), ("flee", "none", "uniform")]
 )

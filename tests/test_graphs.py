@@ -1,5 +1,6 @@
 """Recorded functions, steps and updates give what they give unrecorded; a stand-in records where there is no GPU."""
 
+import contextlib
 import copy
 
 import pytest
@@ -113,6 +114,8 @@ def test_what_recordings_know_by_address_is_kept(recording):
         lambda x: x.unique(),
         lambda x: x.long().bincount(),
         lambda x: (x > 0).nonzero(),
+        lambda x: x[(x > 0).nonzero(as_tuple=True)],
+        lambda x: x if (x > 0).any() else -x,
     ],
     ids=[
         "masks",
@@ -126,14 +129,18 @@ def test_what_recordings_know_by_address_is_kept(recording):
         "unique",
         "counts",
         "selects",
+        "selects as tuple",
+        "asks",
     ],
 )
-def test_what_a_graph_cannot_hold_raises(recording, function):
+@pytest.mark.parametrize("mode", [contextlib.nullcontext, torch.inference_mode])
+def test_what_a_graph_cannot_hold_raises(recording, function, mode):
     fast = Graphed(function, learns=True)
-    for _ in range(WARM_UP):
-        fast(torch.ones(2))
-    with pytest.raises(RuntimeError, match="cannot be recorded"):
-        fast(torch.ones(2))
+    with mode():
+        for _ in range(WARM_UP):
+            fast(torch.ones(2))
+        with pytest.raises(RuntimeError, match="cannot be recorded"):
+            fast(torch.ones(2))
 
 
 def trained(

@@ -229,6 +229,8 @@ def test_noise_of_several_learners_is_that_of_each_alone(kind):
         assert torch.equal(both, torch.cat([draw(noise, step, worlds=4) for noise in alone]))
         assert [part.frames for part in parts] == [noise.frames for noise in alone]
     assert both.abs().max() > 0
+    for process in (part.get_extra_state()["process"] for part in parts if kind == "ou"):
+        assert process.untyped_storage().nbytes() == process.nbytes  # a checkpoint holds nothing of the others
     parts[1].frames += 4
     with pytest.raises(ValueError, match=r"\[48, 52\] frames"):
         draw(together, 1, worlds=8)

@@ -16,7 +16,8 @@ from agents.learners import LearnerStack, make_learner, make_learners
 from agents.maddpg import clip_gradients, update_step
 from agents.networks import make_policies
 from agents.report_runs import find_runs
-from agents.run import TrainingRun, equally_far
+from agents.run import TrainingRun
+from agents.seeds import equally_far
 from conf.naming import config_hash
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.coverage import weighted_sum
@@ -30,6 +31,7 @@ VARIANTS = {
     "networks of their own, minibatches of their own, clipped": (
         *("agent.share_params=false", "agent.minibatch=per_agent", "agent.max_grad_norm=0.05", "env=default"),
     ),
+    "one world to evaluate in": ("eval.num_envs=1",),
     "filter in the loss": ("safety.in_loss=true", "agent.correction_penalty=0.1", "env.n_agents=2"),
     "violations, one update a step": (
         *("safety=none", "env.on_violation=continue", "train.violation_penalty=1", "collector.steps_per_batch=1"),
@@ -140,7 +142,7 @@ def test_a_violation_in_an_evaluation_ends_its_seed_alone(program, tmp_path, mon
             raise ViolationError("a robot ran empty")
 
     monkeypatch.setattr("agents.run.check_violations", check)
-    monkeypatch.setattr("agents.run.broken_promises", lambda td, alive: alive)
+    monkeypatch.setattr("agents.seeds.broken_promises", lambda td, alive: alive)
     code, output = program(train.main, *QUIET, "n_seeds=3")
     assert code == 1
     assert "1 of 3 seeds failed: 1." in output

@@ -8,10 +8,13 @@ from collections import Counter
 
 import pytest
 import torch
+from tensordict.nn import TensorDictSequential
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from agents import make_controller
 from agents.collection import make_collection
+from agents.evaluation import Evaluator
 from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies
@@ -20,7 +23,8 @@ from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
 from agents.recorder import BatchCounter, TrainingRecorder
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv
-from tests.standin_recording import by_mask
+from safety import SafetyConfig, SafetyFilter
+from tests.standin_recording import by_mask, in_parts
 
 CPU = torch.device("cpu")
 ATEN = torch.ops.aten
@@ -40,6 +44,8 @@ class Waits(TorchDispatchMode):
         """By id: the optimisers' counts of steps, which stay on the host."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if (parts := in_parts(self, func, args, kwargs)) is not NotImplemented:
+            return parts
         packet = func.overloadpacket
         if (packet in WAITS or by_mask(func, args)) and id(args[0]) not in self.on_host:
             self.found[str(packet)] += 1
@@ -59,19 +65,21 @@ class Readings(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False) -> dict[str, float]:
+def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False, n_seeds: int = 1) -> dict[str, float]:
     """Waits per iteration of each part of the training loop."""
     config = Config(env=world, fixed_sizes=fixed_sizes)
     config.collector.num_envs = num_envs
+    seeds = list(range(n_seeds))
     learners, learner = make_learners(
-        SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=[0]
+        SurveillanceEnv(world).n_observation, world, config.agent, config.safety, CPU, seeds=seeds
     )
-    _, explore = make_policies(learner.actor, world, config.safety, config.agent, [0], CPU, **config.computing)
+    _, explore = make_policies(learner.actor, world, config.safety, config.agent, seeds, CPU, **config.computing)
     noises = noises_of(explore)
-    collection = make_collection(config, [0], learners, explore, noises, CPU, print)
-    batches = collection.batches(100 * num_envs, resumed=False)
+    collection = make_collection(config, seeds, learners, explore, noises, CPU, print)
+    batches = collection.batches(100 * num_envs * n_seeds, resumed=False)
     multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, CPU, 0)
-    counter, recorder, counts = BatchCounter(world), TrainingRecorder(world, num_envs, CPU), dict.fromkeys(MOST, 0.0)
+    counter, counts = BatchCounter(world, n_seeds), dict.fromkeys(MOST, 0.0)
+    recorders = [TrainingRecorder(world, num_envs, CPU) for _ in seeds]
     mode = Waits()
     readings = Readings(mode.found)
     for k in range(20):
@@ -86,7 +94,8 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
         with mode, readings:
             batch = next(batches)
             spent("collect")
-            recorder.update(batch, *counter(batch))
+            for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
+                recorder.update(own, counted)
             spent("count")
             steps = multi_step(to_transitions(batch))
             if len(steps):
@@ -95,7 +104,9 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
         if k >= 8:
             with mode, readings:
                 minibatch = draw(buffer, 256, learner.loss.reads)
-                update_step(minibatch, *learner.updates, config.agent)
+                update_step(
+                    torch.stack([minibatch] * n_seeds) if n_seeds > 1 else minibatch, *learner.updates, config.agent
+                )
             spent("update")
             steps = [state["step"] for own in learner.optimizers.values() for state in own.state.values()]
             mode.on_host = {id(step): step for step in steps}
@@ -115,6 +126,27 @@ def test_a_step_of_fixed_sizes_does_not_wait(n_agents, num_envs, on_violation, m
     world = SurveillanceConfig(n_agents=n_agents, horizon=100, on_violation=on_violation)
     found = waits(world, num_envs, fixed_sizes=True)
     assert found["collect"] == pytest.approx(most), found
+
+
+def test_several_seeds_wait_as_often_as_one():
+    world = SurveillanceConfig(horizon=100, on_violation="continue")
+    expected = {"collect": 0, "count": 1, "store": 0, "update": 0}
+    assert waits(world, 16, fixed_sizes=True, n_seeds=3) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_an_evaluation_is_read_at_its_end(recorded):
+    world, counts = SurveillanceConfig(on_violation="continue"), []
+    policy = TensorDictSequential(
+        make_controller("lloyd", world), SafetyFilter(SafetyConfig(), world, fixed_sizes=True)
+    )
+    for steps in (5, 25):
+        env, mode = SurveillanceEnv(world, 8, seed=[0, 1], fixed_sizes=True), Waits()
+        with mode, Readings(mode.found):
+            Evaluator(env, cuda_graphs=recorded)(policy, steps, record=True)
+        counts.append(sum(mode.found.values()))
+    assert counts[1] - counts[0] == (0 if recorded else 20)  # unrecorded it asks whether all robots have power
+    assert counts[0] > 0
 
 
 def test_a_step_of_fixed_sizes_does_not_wait_in_space():

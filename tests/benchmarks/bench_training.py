@@ -257,7 +257,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     drawn: list[TensorDictBase] = []
 
     def sample() -> TensorDictBase:
-        if not drawn:  # all of a batch at once, as agents.run.minibatches
+        if not drawn:  # all of a batch at once, as agents.seeds.minibatches
             samples = [draw(buffer, updates * minibatch, learner.loss.reads) for buffer in buffers]
             whole = samples[0] if n_seeds == 1 else torch.stack(samples)
             drawn.extend(reversed(whole.split(minibatch, dim=-1)))
