@@ -9,7 +9,7 @@ import math
 import pytest
 import torch
 
-import safety.filter
+import safety.programs
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.dynamics import limit_speed
 from envs.homing import certified_parts, closest_approach, homing_velocity, is_certified, reserve
@@ -342,7 +342,7 @@ def test_shield_alone_keeps_every_promise(solution, monkeypatch):
         zero = torch.zeros(target.shape[:-1]).to(target)
         return QPSolution(target * (1 - 1e-6), torch.zeros_like(h), status, zero, status)
 
-    monkeypatch.setattr(safety.filter, "project_halfspaces_ball", careless)
+    monkeypatch.setattr(safety.programs, "project_halfspaces_ball", careless)
     for index in SMALL[::2]:
         record = roll_out(*WORLDS[index], seed=index, steps=24)
         assert [*violations(record), left_set(record)] == [0] * 5

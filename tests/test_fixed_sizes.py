@@ -9,7 +9,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import evaluate
 import safety.certificate
-import safety.filter
+import safety.programs
 import train
 from conf.naming import config_hash
 from conf.schema import to_config
@@ -161,7 +161,7 @@ def test_the_shield_alone_keeps_the_promise_and_without_it_nothing_does(monkeypa
         found = project_halfspaces_ball(target, G, torch.full_like(h, torch.inf), radius, **kwargs)
         return found._replace(status=torch.zeros_like(found.status))
 
-    monkeypatch.setattr(safety.filter, "project_halfspaces_ball", careless)
+    monkeypatch.setattr(safety.programs, "project_halfspaces_ball", careless)
     levels = torch.zeros(3, dtype=torch.int64)
     for index in SMALL[::3]:
         record = roll_out(*WORLDS[index], seed=index, steps=24, keep_rows=False, fixed_sizes=True)

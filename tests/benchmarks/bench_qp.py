@@ -31,7 +31,7 @@ from qpth.qp import QPFunction
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-import safety.filter
+import safety.programs
 import safety.qp
 from envs import SurveillanceConfig
 from safety import QPStatus, SafetyConfig, SafetyFilter, solve_qp
@@ -87,8 +87,8 @@ def record(safety_filter: SafetyFilter, state: TensorDictBase) -> Problems | Non
         raise Recorded(*arguments)
 
     with (
-        mock.patch.object(safety.filter, "solve_qp", caught),
-        mock.patch.object(safety.filter, "project_halfspaces_ball", caught),
+        mock.patch.object(safety.programs, "solve_qp", caught),
+        mock.patch.object(safety.programs, "project_halfspaces_ball", caught),
         torch.no_grad(),
     ):
         try:
