@@ -26,16 +26,8 @@ def rollout_steps(horizon: int) -> int:
 
 
 READ: list[NestedKey] = [
-    *(
-        keys.POSITION,
-        keys.ENERGY,
-        keys.STATUS,
-        keys.LEVEL,
-        keys.CORRECTION,
-        keys.RESIDUAL,
-        keys.OUTSIDE,
-        *MARGINS.values(),
-    ),
+    *(keys.POSITION, keys.ENERGY, *MARGINS.values()),
+    *(keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE),
     *(("next", *key) for key in (keys.POSITION, keys.ENERGY, keys.REWARD)),
     *(("next", key) for key in (keys.COVERAGE_COST, keys.DENSITY, "terminated")),
     *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),
