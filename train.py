@@ -13,7 +13,6 @@ import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictSequential
 from tqdm import tqdm
 
 from agents.checkpoint import world_sizes
@@ -21,7 +20,7 @@ from agents.collection import make_collection, seeds_of_streams
 from agents.evaluation import Evaluator
 from agents.interruption import StopSignals
 from agents.learners import make_learners, make_update
-from agents.networks import acting, actor_of_blocks, make_policies
+from agents.networks import actor_of_blocks, make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import BatchCounter, Seconds
@@ -88,9 +87,8 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     )
     update = make_update(learner, config.agent, safety, **graphs)
     modules = (learner.actor, world, safety, config.agent)
-    _, explore_policy = make_policies(*modules, noise_seeds, device, **config.computing)
-    deployed = acting(actor_of_blocks([own.actor for own in learners]), **graphs)
-    policy = TensorDictSequential(deployed, explore_policy[-1])
+    deployed = actor_of_blocks([own.actor for own in learners])
+    policy, explore_policy = make_policies(*modules, noise_seeds, device, deployed=deployed, **config.computing)
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))

@@ -269,6 +269,7 @@ def make_policies(
     seed: int | list[int],
     device: torch.device,
     *,
+    deployed: TensorDictModuleBase | None = None,
     compile_functions: bool = False,
     fixed_sizes: bool = False,
     cuda_graphs: bool = False,
@@ -282,6 +283,7 @@ def make_policies(
         agent: the noise.
         seed: seed of the noise; a list: one per learner, each with its block of the worlds.
         device: of the noise's generator.
+        deployed: takes the place of ``actor`` in the deployment policy.
         compile_functions: the filter's ``compile``, see :class:`safety.SafetyFilter`.
         fixed_sizes: the filter's.
         cuda_graphs: the filter's, and the networks' too.
@@ -291,9 +293,10 @@ def make_policies(
     """
     sizes = {"fixed_sizes": fixed_sizes, "cuda_graphs": cuda_graphs}
     safety_filter = SafetyFilter(safety, world, compile=compile_functions, **sizes)
-    actor = acting(actor, cuda_graphs=cuda_graphs)
+    deployed = actor if deployed is None else deployed
+    deployed, actor = (acting(own, cuda_graphs=cuda_graphs) for own in (deployed, actor))
     if isinstance(seed, list):
         noise = NoiseOfSeeds([ExplorationNoise(agent, world, own, device) for own in seed])
     else:
         noise = ExplorationNoise(agent, world, seed, device)
-    return TensorDictSequential(actor, safety_filter), TensorDictSequential(actor, noise, safety_filter)
+    return TensorDictSequential(deployed, safety_filter), TensorDictSequential(actor, noise, safety_filter)

@@ -96,13 +96,14 @@ def explore(parts: list[ExplorationNoise], tensordict: TensorDictBase) -> Tensor
     if any(part.frames != first.frames for part in parts):
         raise ValueError(f"the learners' noise has seen {[part.frames for part in parts]} frames: they go on together.")
     noise = torch.empty_like(action, memory_format=torch.contiguous_format)
-    for part, block in zip(parts, noise.chunk(len(parts)), strict=True):
+    blocks = noise.chunk(len(parts))
+    for part, block in zip(parts, blocks, strict=True):
         torch.randn(block.shape, generator=part.generator, out=block)
     if first.agent.noise == "ou":
         keep = 1 - first.agent.ou_theta
         noise = noise * (1 - keep**2) ** 0.5
         before = [part.process for part in parts if part.process is not None]
-        if len(before) == len(parts) and before[0].shape == noise.chunk(len(parts))[0].shape:
+        if len(before) == len(parts) and before[0].shape == blocks[0].shape:
             whole = before[0] if len(before) == 1 else torch.cat(before)
             noise = noise + keep * torch.where((step == 0).unsqueeze(-1), 0.0, whole)
         for part, block in zip(parts, noise.chunk(len(parts)), strict=True):

@@ -67,9 +67,8 @@ class TrainingRun:
         self.error: Exception | None = None
         """What ended the run before its time, where it shares its program with others."""
         _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
-        self.batch_size = config.buffer.batch_size * (
-            config.env.n_agents if config.agent.minibatch == "per_agent" else 1
-        )
+        per_agent = config.agent.minibatch == "per_agent"
+        self.batch_size = config.buffer.batch_size * (config.env.n_agents if per_agent else 1)
         self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
