@@ -30,8 +30,7 @@ class Board:
     """
 
     def __init__(self, folder: Path, frames: int, config: Mapping[str, Any], *, figures: bool, gif: bool) -> None:
-        # the queue holds a point of all curves: at TensorBoard's ten places the run waits for the disk
-        self.writer = SummaryWriter(str(folder), max_queue=1000, purge_step=frames + 1 if frames else None)
+        self.writer = SummaryWriter(str(folder), purge_step=frames + 1 if frames else None)
         self.figures, self.gif = figures, gif
         if not frames:
             self._hyperparameters(config)
@@ -42,9 +41,9 @@ class Board:
         return self.figures or self.gif
 
     def scalars(self, values: Mapping[str, float], frames: int) -> None:
-        """Log numbers by tag."""
-        for tag, value in values.items():
-            self.writer.add_scalar(tag, value, frames)
+        """Log numbers by tag, as one event: TensorBoard opens the file anew for each."""
+        found = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
+        self.writer._get_file_writer().add_summary(Summary(value=found), frames)
 
     def histogram(self, tag: str, values: Tensor, frames: int) -> None:
         """Log a histogram of all entries that are finite."""
