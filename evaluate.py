@@ -54,7 +54,7 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    sizes = {"fixed_sizes": config.fixed_sizes, "cuda_graphs": config.cuda_graphs}
+    sizes = {"fixed_sizes": config.fixed_sizes or config.cuda_graphs, "cuda_graphs": config.cuda_graphs}
     env = SurveillanceEnv(world, config.num_envs, device, env_seed, compile_functions=config.compile, **sizes)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)

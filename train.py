@@ -24,6 +24,7 @@ from agents.networks import actor_of_blocks, make_policies
 from agents.noise import noises_of
 from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import BatchCounter, Seconds
+from agents.replay import Replay
 from agents.run import FAILURES, TrainingRun
 from agents.seeds import (
     SeedsFailedError,
@@ -32,8 +33,8 @@ from agents.seeds import (
     errors_by_seed,
     evaluate,
     for_each,
+    log,
     minibatches,
-    shares,
     stopped_at,
 )
 from conf.callbacks import one_clear_error
@@ -77,21 +78,20 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     seconds = Seconds("build", "collect", "update", "evaluate", "checkpoint")
     device = pick_device(config.device)
     use_threads(config.threads, deterministic=config.deterministic)
-    world, safety, seeds = config.env, config.safety, list(folders)
-    noise_seeds = [seeds_of_streams(seed)[1] for seed in seeds]
+    world, agent, safety, seeds = config.env, config.agent, config.safety, list(folders)
+    _, noise_seeds, replay_seeds, _ = map(list, zip(*map(seeds_of_streams, seeds), strict=True))
     graphs = {"cuda_graphs": config.cuda_graphs}
     eval_env = SurveillanceEnv(world, len(seeds) * config.eval.num_envs, device, seeds, **config.computing)
     evaluator = Evaluator(eval_env, **graphs)
-    learners, learner = make_learners(
-        eval_env.n_observation, world, config.agent, safety, device, seeds=seeds, **graphs
-    )
-    update = make_update(learner, config.agent, safety, **graphs)
-    modules = (learner.actor, world, safety, config.agent)
+    learners, learner = make_learners(eval_env.n_observation, world, agent, safety, device, seeds=seeds, **graphs)
+    update = make_update(learner, agent, safety, **graphs)
+    modules = (learner.actor, world, safety, agent)
     deployed = actor_of_blocks([own.actor for own in learners])
     policy, explore_policy = make_policies(*modules, noise_seeds, device, deployed=deployed, **config.computing)
     noises = noises_of(explore_policy)
     collection = make_collection(config, seeds, learners, explore_policy, noises, device, tqdm.write)
-    multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=len(folders))
+    multi_step = MultiStep(agent.n_steps, agent.gamma, n_blocks=len(folders))
+    replay = Replay(config.buffer.capacity, replay_seeds, device)
     counter, adversary = BatchCounter(world, len(folders), **graphs), config.adversary_reward()
     seconds.watch("policy", explore_policy)
     seconds.watch("filter", explore_policy[-1])
@@ -103,6 +103,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             worlds=collection.blocks[k],
             waiting=multi_step.blocks[k],
             noise=noises[k],
+            buffer=replay.parts[k],
             sizes=world_sizes(eval_env),
             device=device,
             seconds=seconds,
@@ -131,14 +132,15 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
     with StopSignals() as stop, closing(collection.batches(frames * n_runs, resumed=start > 0)) as batches:
         for batch in batches:
             transitions = to_transitions(batch, config.train.violation_penalty, adversary)
-            parts = (batch, multi_step(transitions), transitions["next"][keys.REWARD])
-            for_each(runs, TrainingRun.take, counter(batch), *(shares(part, runs) for part in parts))
+            counted = counter(batch)
+            replay.store(multi_step(transitions))
             seconds.spent("collect")
             if any(run.learns for run in runs):
-                for minibatch in minibatches(runs, config.train.n_updates):
-                    losses = update(minibatch)
+                losses = update(minibatches(replay, config.train.n_updates, config.batch_size, learner.loss.reads))
             seconds.spent("update")
-            for_each(runs, TrainingRun.log, [losses] * n_runs, [seconds] * n_runs, range(n_runs))
+            for_each(runs, TrainingRun.take, counted)  # checks the batch: a GPU meanwhile goes on with the updates
+            seconds.spent("collect")
+            log(runs, transitions["next"][keys.REWARD], losses, seconds)
             bar.set_postfix_str(runs[0].progress, refresh=False)
             bar.update(batch.numel())
             due = [run.evaluates for run in runs]

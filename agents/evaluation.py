@@ -174,42 +174,44 @@ class Evaluator:
         *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         """:class:`Measured` after a transition whose tensors are in the order of ``_keys``."""
+        config = self.env.config
         td = TensorDict(dict(zip(self._keys, tensors, strict=True)), alive.shape[:1])
-        following, blocks = td["next"], self.env.n_blocks
-        # a recording does not ask; where it is known that all have power, their cost is the coverage cost
-        powered = not self.recorded and bool((following[keys.ENERGY] >= self.env.config.energy_min).all())
-        parts = zip(td.chunk(blocks), alive.chunk(blocks), strict=True)
-        numbers = [self._block_numbers(*part, all_powered=powered) for part in parts]
-        added, now = (torch.stack(x) for x in zip(*numbers, strict=True))
+        energy, next_energy = td[keys.ENERGY].squeeze(-1), td["next"][keys.ENERGY].squeeze(-1)
+        found = self._block_numbers(td, alive)
+        added = torch.stack([found[name].double() for name in ADDED], dim=-1)
+        absent = torch.full_like(found["cost"], math.inf)  # a barrier that the filter does not write
+        now = torch.stack([found.get(name, absent).double() for name in LEAST], dim=-1)
         # a margin that is not a number stays so; a barrier that is not a number is passed over
         least = torch.cat([torch.minimum(least[:, :2], now[:, :2]), torch.fmin(least[:, 2:], now[:, 2:])], dim=-1)
-        energy, next_energy = td[keys.ENERGY].squeeze(-1), following[keys.ENERGY].squeeze(-1)
-        charges = Charges(start, counted, count).after(energy, next_energy, alive, self.env.config)
-        return alive & ~following["terminated"], *charges, sums + added, least
+        charges = Charges(start, counted, count).after(energy, next_energy, alive, config)
+        return alive & ~td["next"]["terminated"], *charges, sums + added, least
 
-    def _block_numbers(self, td: TensorDictBase, alive: Tensor, *, all_powered: bool) -> tuple[Tensor, Tensor]:
-        """What a block's transition adds to its sums, and its own margins and barriers."""
-        config, following = self.env.config, td["next"]
-        cost = following[keys.COVERAGE_COST]
-        powered_cost = cost if all_powered else self._powered_cost(following)
-        next_energy = following[keys.ENERGY].squeeze(-1)
+    def _block_numbers(self, td: TensorDictBase, alive: Tensor) -> dict[str, Tensor]:
+        """What a transition adds to the sums of each block, and its margins and barriers, ``(seeds,)`` by name."""
+        config, following, n_blocks = self.env.config, td["next"], self.env.n_blocks
+
+        def blocks(x: Tensor) -> Tensor:
+            return x.reshape(n_blocks, -1)
+
+        cost, next_energy = following[keys.COVERAGE_COST], following[keys.ENERGY].squeeze(-1)
+        powered = cost
+        # a recording does not ask; where it is known that all have power, their cost is the coverage cost
+        if self.recorded or not bool((next_energy >= config.energy_min).all()):
+            powered = torch.cat([self._powered_cost(part) for part in following.chunk(n_blocks)])
         margin = torch.minimum(next_energy - config.energy_min, config.energy_max - next_energy)
         gap = minimum_distance(td[keys.POSITION], following[keys.POSITION]) - config.safety_distance
         found = {
-            "worlds": alive.sum(),
-            "cost": torch.where(alive, cost, 0).sum(dtype=torch.float64),
-            "powered": torch.where(alive, powered_cost, 0).sum(dtype=torch.float64),
-            "reward": torch.where(alive, following[keys.REWARD].mean(dim=-2), 0).sum(dtype=torch.float64),
-            "energy_margin": torch.where(alive, margin, math.inf).min(),
-            "distance_margin": torch.where(alive.squeeze(-1), gap, math.inf).min(),
-            **filter_numbers(td, config.max_speed, alive),
+            "worlds": blocks(alive).sum(-1),
+            "cost": blocks(torch.where(alive, cost, 0)).sum(-1, dtype=torch.float64),
+            "powered": blocks(torch.where(alive, powered, 0)).sum(-1, dtype=torch.float64),
+            "reward": blocks(torch.where(alive, following[keys.REWARD].mean(dim=-2), 0)).sum(-1, dtype=torch.float64),
+            "energy_margin": blocks(torch.where(alive, margin, math.inf)).amin(-1),
+            "distance_margin": blocks(torch.where(alive.squeeze(-1), gap, math.inf)).amin(-1),
+            **filter_numbers(td, config.max_speed, alive, n_blocks),
         }
         for kind in keys.VIOLATION_KINDS:
-            found[kind] = (following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum()
-        found["residual"] = -found["max_residual"]
-        absent = found["cost"].new_full((), math.inf)  # a barrier that the filter does not write
-        added = torch.stack([found[name].double() for name in ADDED])
-        return added, torch.stack([found.get(name, absent).double() for name in LEAST])
+            found[kind] = blocks(following[(*keys.VIOLATION, kind)].squeeze(-1) & alive).sum(-1)
+        return found | {"residual": -found["max_residual"]}
 
     def _powered_cost(self, state: TensorDictBase) -> Tensor:
         """Coverage cost of the robots that are not drained, ``(B, 1)``, m^2; the coverage cost itself where none is."""

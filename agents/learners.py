@@ -7,7 +7,8 @@ of single ones: so with the default's layers and robots; not with one robot, in 
 it is to rounding.
 """
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -141,26 +142,35 @@ def make_learners(*args: object, seeds: Sequence[int], cuda_graphs: bool = False
 
 def make_update(
     learner: Learner, agent: AgentConfig, safety: SafetyConfig, *, cuda_graphs: bool = False
-) -> Callable[[TensorDictBase], dict[str, Tensor]]:
-    """:func:`agents.maddpg.update_step` of a learner, as a function of the minibatch.
+) -> Callable[[Iterable[TensorDictBase]], dict[str, Tensor]]:
+    """:func:`agents.maddpg.update_step` of a learner by one minibatch after the other, as a function of them.
 
     Args:
         learner: with ``cuda_graphs`` if asked for here.
         agent: reduction and clipping.
         safety: the filter; one inside the loss solves programs whose number depends on the data, and is not recorded.
         cuda_graphs: record the update and replay it (:mod:`envs.graphs`).
+
+    Returns:
+        A function that returns what the last update measured.
     """
-
-    def update(minibatch: TensorDictBase) -> dict[str, Tensor]:
-        return update_step(minibatch, *learner.updates, agent)
-
-    if not cuda_graphs or safety.in_loss:
-        return update
     reads = learner.loss.reads
 
-    def update_on(*tensors: Tensor) -> dict[str, Tensor]:
+    def update_on(*tensors: Tensor, measure: bool) -> dict[str, Tensor]:
         observation = tensors[0]
-        return update(TensorDict(dict(zip(reads, tensors, strict=True)), observation.shape[:-2], observation.device))
+        batch = TensorDict(dict(zip(reads, tensors, strict=True)), observation.shape[:-2], observation.device)
+        return update_step(batch, *learner.updates, agent, measure=measure)
 
-    recorded = Graphed(update_on, learns=True)
-    return lambda minibatch: recorded(*(minibatch[key] for key in reads))
+    steps = [functools.partial(update_on, measure=measure) for measure in (False, True)]
+    if cuda_graphs and not safety.in_loss:
+        steps = [Graphed(step, learns=True) for step in steps]
+
+    def update(minibatches: Iterable[TensorDictBase]) -> dict[str, Tensor]:
+        waiting: list[Tensor] = []
+        for batch in minibatches:
+            if waiting:
+                steps[False](*waiting)
+            waiting = [batch[key] for key in reads]
+        return steps[True](*waiting) if waiting else {}
+
+    return update

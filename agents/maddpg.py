@@ -261,6 +261,8 @@ def update_step(
     optimizers: dict[str, torch.optim.Optimizer],
     target_updater: SoftUpdate,
     agent: AgentConfig,
+    *,
+    measure: bool = True,
 ) -> dict[str, Tensor]:
     """One gradient step of all critics and all actors, then the soft update of the targets.
 
@@ -271,24 +273,27 @@ def update_step(
         optimizers: from :func:`make_optimizers`.
         target_updater: soft update of the target networks.
         agent: reduction and clipping.
+        measure: otherwise return nothing, in less time.
 
     Returns:
         Detached losses, mean Q and target, gradient norms: ``()`` each, or ``(K,)``.
     """
     losses = loss_module(batch)
-    metrics: dict[str, Tensor] = {
-        "q_value": losses["pred_value"].detach().mean((-2, -1)),
-        "target": losses["target_value"].detach().mean((-2, -1)),
-    }
     n_learners = batch.shape[:-1].numel()
     reduced = {name: reduce_robots(losses[name], agent) for name in optimizers}
     weights = {name: optimizer.param_groups[0]["params"] for name, optimizer in optimizers.items()}
     for weight in itertools.chain(*weights.values()):  # as zero_grad, which takes ten times as long
         weight.grad = None
     torch.autograd.backward([loss.sum() for loss in reduced.values()])  # no weight is in both
+    norms = {}
     for name, optimizer in optimizers.items():
-        norm = clip_gradients(weights[name], agent.max_grad_norm or math.inf, n_learners)
+        if measure or agent.max_grad_norm:
+            norms[name] = clip_gradients(weights[name], agent.max_grad_norm or math.inf, n_learners)
         optimizer.step()
-        metrics |= {f"grad_norm_{name.removeprefix('loss_')}": norm, name.removeprefix("loss_"): reduced[name].detach()}
     target_updater.step()
-    return metrics
+    if not measure:
+        return {}
+    metrics = {name.removeprefix("loss_"): reduced[name].detach() for name in optimizers}
+    metrics |= {f"grad_norm_{name.removeprefix('loss_')}": norm for name, norm in norms.items()}
+    means = {"q_value": "pred_value", "target": "target_value"}
+    return metrics | {name: losses[key].detach().mean((-2, -1)) for name, key in means.items()}

@@ -1,20 +1,20 @@
-"""Construction of the training pipeline: environment, collector and replay buffer."""
+"""The training pipeline up to the replay buffer: collector, what is stored of a batch, n-step transitions."""
 
 import contextlib
 import ctypes
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from typing import cast
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import TensorDictRoundRobinWriter
+from torchrl.envs.utils import set_exploration_type
 
 from agents.adversary_reward import AdversaryReward
+from agents.replay import flat
 from envs import SurveillanceEnv, keys
 
 STORED = (
@@ -28,7 +28,7 @@ COLLECTOR_OPTIONS = {
     "track_traj_ids": False,
     "trust_policy": True,
     "auto_register_policy_transforms": False,  # the noise reads the world's own step count
-    "return_same_td": True,  # a batch is used before the next one is collected: no copy
+    "return_same_td": True,  # no copy
     "no_cuda_sync": True,  # one device, one stream
 }
 STEPS = "steps_to_next_obs"  # TorchRL's name for the length of an n-step transition
@@ -74,12 +74,16 @@ def use_threads(threads: int, *, deterministic: bool = False) -> None:
 
 
 class InferenceCollector(Collector):
-    """TorchRL's collector, in :meth:`SurveillanceEnv.without_gradients`. Its batches are ordinary tensors."""
+    """TorchRL's collector, in :meth:`SurveillanceEnv.without_gradients`; batches of one step are not copied together."""
 
     def rollout(self) -> TensorDictBase:
-        """As TorchRL's."""
-        with self.env.without_gradients():
-            return super().rollout()
+        """What TorchRL's does with :data:`COLLECTOR_OPTIONS`."""
+        steps = []
+        with self.env.without_gradients(), set_exploration_type(self.exploration_type):
+            for _ in range(self.frames_per_batch):
+                step, self._carrier = self.env.step_and_maybe_reset(self._wrapped_policy(self._carrier))
+                steps.append(step)
+            return cast(TensorDictBase, steps[0].unsqueeze(-1) if len(steps) == 1 else torch.stack(steps, dim=-1))
 
 
 def collect(
@@ -87,7 +91,8 @@ def collect(
 ) -> Generator[TensorDictBase, None, None]:
     """Batches ``(num_envs, T)`` of TorchRL's collector; warm-up uses the policy, never the environment's random action.
 
-    Each batch takes the place of the one before, in the same memory.
+    They are inference tensors: whoever differentiates what comes from a batch itself, and not from rows that were stored or
+    cloned, is told so by PyTorch.
 
     Args:
         env: the worlds, closed at the end.
@@ -113,67 +118,6 @@ def collect(
         yield from collector
     finally:
         collector.shutdown()
-
-
-class RowStorage(LazyTensorStorage):
-    """TorchRL's storage, which copies rows that lie one after the other all at once: four times as fast."""
-
-    def set_rows(self, start: int, rows: TensorDictBase) -> None:
-        """Write rows ``(M,)`` from place ``start`` on."""
-        stop = start + len(rows)
-        if not self.initialized:
-            self.set(slice(start, stop), rows)
-            return
-        to, source = self._storage, flat(rows)
-        torch._foreach_copy_([to.get(key)[start:stop] for key in source], list(source.values()))
-        self._len = max(self._len, stop)
-
-    def rows(self, index: Tensor, reads: Sequence[NestedKey]) -> TensorDictBase:
-        """The entries ``reads`` of the rows at ``index`` ``(M,)``."""
-        found = {key: self._storage.get(key).index_select(0, index) for key in reads}
-        return TensorDict(found, [len(index)], self.device)
-
-
-class SliceWriter(TensorDictRoundRobinWriter):
-    """TorchRL's round robin, which writes rows that lie one after the other as a slice: faster, and without a wait for the GPU."""
-
-    def extend(self, data: TensorDictBase) -> torch.Tensor:
-        """Write ``data`` ``(M,)``; returns the rows' places ``(M,)``."""
-        start, stop, size = self._cursor, self._cursor + len(data), self._storage.max_size
-        if stop > size:
-            return super().extend(data)
-        index = torch.arange(start, stop, device=data.device)
-        self._cursor, self._write_count = stop % size, self._write_count + len(data)
-        self._storage.set_rows(start, data.set("index", index))
-        self._mark_update_entities(index)
-        return index
-
-
-def make_buffer(capacity: int, device: torch.device, seed: int) -> TensorDictReplayBuffer:
-    """Uniform replay with its own generator. It holds the executed action and every key that the filter reads."""
-    generator = torch.Generator(device=device).manual_seed(seed)  # the storage draws rows where it lies
-    storage = RowStorage(capacity, device=device)
-    return TensorDictReplayBuffer(storage=storage, writer=SliceWriter(), generator=generator)
-
-
-def store(buffer: TensorDictReplayBuffer, rows: TensorDictBase) -> None:
-    """What ``buffer.extend(rows)`` does for the buffers of :func:`make_buffer`, whose sampler has no priorities to set.
-
-    Args:
-        buffer: the buffer.
-        rows: ``(M,)``; gets an entry "index".
-    """
-    buffer.writer.extend(rows)
-
-
-def draw(buffer: TensorDictReplayBuffer, count: int, reads: Sequence[NestedKey]) -> TensorDictBase:
-    """What ``buffer.sample(count)`` draws, but only the entries ``reads``: five times as fast.
-
-    Returns:
-        ``(count,)``.
-    """
-    index, _ = buffer.sampler.sample(buffer.storage, count)
-    return cast(RowStorage, buffer.storage).rows(index, reads)
 
 
 def to_transitions(
@@ -225,8 +169,8 @@ class MultiStep:
             self.waiting = flat(cast(TensorDictBase, torch.cat(restored)).to(transitions.device))  # pyright: ignore[reportArgumentType]
             for block in self.blocks:
                 block.restored = None
-        window = {  # tensors of its own: the collector writes into the batch
-            key: torch.cat([self.waiting[key], new], dim=1) if self.waiting else new.clone()
+        window = {
+            key: torch.cat([self.waiting[key], new], dim=1) if self.waiting else new
             for key, new in flat(transitions).items()
         }
         reward, done = window["next", *keys.REWARD], window["next", "done"].squeeze(-1)
@@ -251,12 +195,6 @@ class MultiStep:
         taken = (ahead + 1).to(total.dtype)[..., None, None].expand_as(total)
         found |= {("next", *keys.REWARD): total.flatten(0, 1), (STEPS,): taken.flatten(0, 1)}
         return TensorDict(found, [worlds * length], transitions.device)
-
-
-def flat(rows: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
-    """The tensors of a tensordict by tuple of names."""
-    items = rows.items(include_nested=True, leaves_only=True)
-    return {(name,) if isinstance(name, str) else name: value for name, value in items}
 
 
 class WaitingSteps:

@@ -1,8 +1,9 @@
 """What a training run measures: violations, episodes and filter over the batches, in numbers for log and summary."""
 
+import functools
 import math
 import time
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -109,17 +110,61 @@ class Seconds:
         self.inside = {name: state["inside"].get(name, 0.0) for name in self.inside}
 
 
-class Counted(NamedTuple):
-    """What :class:`BatchCounter` found in the batch of one learner."""
+class Reading:
+    """Numbers on their way from the device to the host, which need not wait for what the device is asked afterwards.
 
-    sums: dict[str, float]
-    """Violations by kind, "cost", "done" and "finite" (1 or 0), and what :meth:`FilterStatistics.add` takes."""
+    Args:
+        values: of any shape.
+    """
+
+    def __init__(self, values: Tensor) -> None:
+        self._values = values.to("cpu", non_blocking=True)
+        self._arrival = torch.cuda.current_stream(values.device).record_event() if values.is_cuda else None
+
+    @functools.cached_property
+    def numbers(self) -> list:
+        """The values, once they have come."""
+        if self._arrival is not None:
+            self._arrival.synchronize()
+        return self._values.tolist()
+
+
+@dataclass
+class Counted:
+    """What :class:`BatchCounter` finds in the batch of one learner."""
+
+    reading: Reading
+    """The sums of all learners."""
+    names: list[str]
+    """Of the sums."""
     violating: Tensor
     """Violating robots of each step, ``(num_envs, T)``."""
+    reward: Tensor
+    """Reward that all robots have in common, ``(num_envs, T)``."""
+    done: Tensor
+    """Whether the episode ends, ``(num_envs, T)``."""
+    whole: TensorDictBase
+    """The batch of all learners."""
+    k: int
+    """Which learner."""
+
+    @functools.cached_property
+    def sums(self) -> dict[str, float]:
+        """Violations by kind, "cost", "done" and "finite" (1 or 0), and what :meth:`FilterStatistics.add` takes.
+
+        The first to ask waits for the device.
+        """
+        return dict(zip(self.names, self.reading.numbers[self.k], strict=True))
+
+    @property
+    def batch(self) -> TensorDictBase:
+        """The learner's own batch ``(num_envs, T)``."""
+        worlds = len(self.done)
+        return self.whole[self.k * worlds : (self.k + 1) * worlds]
 
 
 class BatchCounter:
-    """Sums over collected batches; waits for the device once a batch, however many learners there are.
+    """Sums over collected batches. Whoever wants to know them waits for the device, once a batch for all learners.
 
     Args:
         world: the world.
@@ -137,29 +182,33 @@ class BatchCounter:
         """``(n_learners * num_envs, T)``: what each learner's worlds hold."""
         self._keys = self._keys or [key for key in COUNTED if key in batch.keys(True)]
         sums, violating = self._count(*(batch[key] for key in self._keys))
-        found = (dict(zip(self._names, row, strict=True)) for row in sums.tolist())
-        return [Counted(*own) for own in zip(found, violating.chunk(self.n_learners), strict=True)]
+        reading = Reading(sums)
+        steps = (violating, batch["next", *keys.REWARD][..., 0, 0], batch["next", "done"].squeeze(-1))
+        own = zip(*(value.chunk(self.n_learners) for value in steps), strict=True)
+        return [Counted(reading, self._names, *parts, batch, k) for k, parts in enumerate(own)]
 
     def _count_tensors(self, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        """Of tensors ``(n_learners * num_envs, T, ...)`` in the order of ``_keys``: ``(n_learners, sums)``, violating."""
-        blocks = zip(*(tensor.chunk(self.n_learners) for tensor in tensors), strict=True)
-        parts = [TensorDict(dict(zip(self._keys, block, strict=True)), block[0].shape[:2]) for block in blocks]
-        sums, violating = zip(*(self._sums(part) for part in parts), strict=True)
-        return torch.stack(sums), torch.cat(violating)
+        """Of tensors ``(n_learners * num_envs, T, ...)`` in the order of ``_keys``.
 
-    def _sums(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Sums over a learner's batch, float64, in the order of ``_names``, and the violating robots of each step."""
+        Returns:
+            ``(n_learners, sums)`` float64 in the order of ``_names``, and the violating robots of each step.
+        """
+
+        def blocks(x: Tensor) -> Tensor:
+            return x.reshape(self.n_learners, -1)
+
+        batch = TensorDict(dict(zip(self._keys, tensors, strict=True)), tensors[0].shape[:2])
         following = batch["next"]
         flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
-        found = dict(zip(keys.VIOLATION_KINDS, (flag.sum().double() for flag in flags), strict=True))
-        found["cost"] = following[keys.COVERAGE_COST].sum().double()
-        found["done"] = following["done"].any().double()
+        found = {kind: blocks(flag).sum(-1) for kind, flag in zip(keys.VIOLATION_KINDS, flags, strict=True)}
+        found["cost"] = blocks(following[keys.COVERAGE_COST]).sum(-1)
+        found["done"] = blocks(following["done"]).any(-1)
         # finite only if all terms are; an overflow is looked at more closely
-        found["finite"] = torch.stack([batch[key].sum() for key in WATCHED.values()]).isfinite().all().double()
-        found |= filter_numbers(batch, self.world.max_speed)
+        found["finite"] = torch.stack([blocks(batch[key]).sum(-1) for key in WATCHED.values()]).isfinite().all(0)
+        found |= filter_numbers(batch, self.world.max_speed, n_blocks=self.n_learners)
         self._names = list(found)
         violating = torch.stack(flags).any(dim=0).sum(-1)  # a robot may violate twice at once
-        return torch.stack(list(found.values())), violating
+        return torch.stack([value.double() for value in found.values()], dim=-1), violating
 
 
 class TrainingRecorder:
@@ -193,12 +242,8 @@ class TrainingRecorder:
         self.best_cost = cost
         return True
 
-    def update(self, batch: TensorDictBase, counted: Counted) -> bool:
-        """Take in a collected batch; waits for the device where episodes end.
-
-        Args:
-            batch: ``(num_envs, T)``.
-            counted: what was found in it.
+    def update(self, counted: Counted) -> bool:
+        """Take in what was found in a collected batch; waits for it, and for the device where episodes end.
 
         Returns:
             Whether there is something in it that ought not to be: a violation, a state outside the filter's set, or a number
@@ -208,13 +253,12 @@ class TrainingRecorder:
         for kind in keys.VIOLATION_KINDS:
             self.violations[kind] += int(found[kind])
             self._violations_recent[kind] += int(found[kind])
-        reward, done = batch["next", *keys.REWARD][..., 0, 0], batch["next", "done"].squeeze(-1)
-        self.episodes.update(reward, counted.violating, done, any_done=found["done"] > 0)
+        self.episodes.update(counted.reward, counted.violating, counted.done, any_done=found["done"] > 0)
         self.filter.add(found)
         self._recent.add(found)
         self._cost[0] += found["cost"]
-        self._cost[1] += batch.numel()
-        self.frames += batch.numel()
+        self._cost[1] += counted.done.numel()
+        self.frames += counted.done.numel()
         return any(found[kind] > 0 for kind in (*keys.VIOLATION_KINDS, "outside")) or not found["finite"]
 
     def scalars(self) -> dict[str, float]:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import TensorDictReplayBuffer
 
 from agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from agents.replay import ReplayOfLearner
 from envs.randomness import restore_generator
 
 
@@ -22,9 +22,9 @@ class ReplayFiles:
         buffer: the buffer; nothing is deleted from it, its oldest rows are overwritten.
     """
 
-    def __init__(self, folder: Path, buffer: TensorDictReplayBuffer) -> None:
+    def __init__(self, folder: Path, buffer: ReplayOfLearner) -> None:
         self.folder, self.buffer = folder, buffer
-        self.capacity: int = buffer.storage.max_size
+        self.capacity = buffer.replay.capacity
         self.saved = 0
         """Rows that the last checkpoint knows of."""
         self.saved_before = 0
@@ -32,15 +32,17 @@ class ReplayFiles:
 
     def save(self) -> dict:
         """Write the new rows; returns what :meth:`load` needs."""
-        state = self.buffer.state_dict()
-        written: int = self.buffer.write_count
+        written = self.buffer.written
         start = max(self.saved, written - self.capacity)
         if written > start:
-            index = torch.arange(start, written) % self.capacity
-            rows = self.buffer.storage.get(index).to_dict()
+            rows = self.buffer.rows(start, written).to_dict()
             save_checkpoint(self.folder / f"rows_{start:015d}_{written:015d}.pt", {"rows": rows})
         self.saved_before, self.saved = self.saved, written
-        return {"written": written, "written_before": self.saved_before, "rng": state["_rng"]}
+        return {
+            "written": written,
+            "written_before": self.saved_before,
+            "rng": (self.buffer.generator.get_state(), str(self.buffer.replay.device)),
+        }
 
     def prune(self) -> None:
         """Delete the files that neither of the last two checkpoints needs."""
@@ -66,30 +68,20 @@ class ReplayFiles:
             CheckpointError: if rows are missing or damaged.
         """
         written, capacity = state["written"], self.capacity
-        first = max(0, written - capacity)
-        at, parts = first, []
+        at, parts = max(0, written - capacity), []
         files = ReplayFiles(source, self.buffer)._files()
         for path, (start, end) in sorted(files.items(), key=lambda item: item[1]):
             if start <= at < end <= written:
-                device = getattr(self.buffer.storage, "device", "cpu")
-                rows = TensorDict(load_checkpoint(path, device)["rows"], [end - start])
-                parts.append(rows[at - start :])
+                rows = TensorDict(load_checkpoint(path, self.buffer.replay.device)["rows"], [end - start])
+                parts.append(rows[at - start :].exclude("index"))  # which earlier versions saved, too
                 at = end
         if at < written:
             raise CheckpointError(
                 f"{source} lacks the replay rows {at} to {written} of this checkpoint. Use a newer checkpoint of an unfinished "
                 "run, or checkpoint.buffer=false: it goes on with an empty replay buffer, so not to the same bits."
             )
-        if parts:
-            rows = torch.cat(parts)  # row k belongs at index k modulo capacity
-            shift = written % capacity if written > capacity else 0
-            self.buffer.extend(torch.cat([rows[len(rows) - shift :], rows[: len(rows) - shift]]) if shift else rows)
-        content = self.buffer.state_dict()
-        writer = {"_cursor": written % capacity, "_write_count": written}
-        self.buffer.load_state_dict(content | {"_writer": content["_writer"] | writer, "_rng": None})
-        generator = torch.Generator(device=content["_rng"][1])
-        restore_generator(generator, state["rng"][0])
-        self.buffer.set_rng(generator)
+        self.buffer.restore(torch.cat(parts) if parts else None, written)
+        restore_generator(self.buffer.generator, state["rng"][0])
         if source != self.folder:  # of another run: the next checkpoint writes all rows into this one's folder
             return
         self.saved, self.saved_before = written, state["written_before"]

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 
 from agents.board import Board
 from agents.checkpoint import CheckpointError
@@ -17,8 +15,9 @@ from agents.evaluation import Evaluation, evaluation_scalars
 from agents.incident import ViolationError, check_violations
 from agents.learners import Learner
 from agents.noise import ExplorationNoise
-from agents.pipeline import WaitingSteps, make_buffer, store
+from agents.pipeline import WaitingSteps
 from agents.recorder import Counted, Every, Seconds, TrainingRecorder
+from agents.replay import ReplayOfLearner
 from agents.training_config import Config
 from agents.training_state import TrainingState
 from envs import keys
@@ -41,8 +40,9 @@ class TrainingRun:
         worlds: its worlds.
         waiting: its steps that wait for n-step transitions.
         noise: its exploration noise.
+        buffer: its part of the replay, empty.
         sizes: of the networks, by :func:`agents.checkpoint.world_sizes`.
-        device: of the replay buffer and the counters.
+        device: of the counters.
         seconds: where the program's time goes.
     """
 
@@ -58,18 +58,16 @@ class TrainingRun:
         worlds: Block,
         waiting: WaitingSteps,
         noise: ExplorationNoise,
+        buffer: ReplayOfLearner,
         sizes: dict,
         device: torch.device,
         seconds: Seconds,
     ) -> None:
         self.folder, self.config, self.seed, self.origin, self.settings = folder, config, seed, origin, settings
-        self.worlds, self.learner, self.noise = worlds, learner, noise
+        self.worlds, self.learner, self.noise, self.buffer = worlds, learner, noise, buffer
         self.error: Exception | None = None
         """What ended the run before its time, where it shares its program with others."""
-        _, _, buffer_seed, self.eval_seed = seeds_of_streams(seed)
-        per_agent = config.agent.minibatch == "per_agent"
-        self.batch_size = config.buffer.batch_size * (config.env.n_agents if per_agent else 1)
-        self.buffer = make_buffer(config.buffer.capacity, device, buffer_seed)
+        *_, self.eval_seed = seeds_of_streams(seed)
         self.recorder = TrainingRecorder(config.env, config.collector.num_envs, device)
         self.clocks = {
             "log": Every(max(1, config.collector.total_frames // config.log.points)),
@@ -82,7 +80,7 @@ class TrainingRun:
         parts |= {"seconds": seconds}
         made_for = {"config": settings, "world": sizes}
         keep, with_buffer = config.checkpoint.keep, config.checkpoint.buffer
-        self.state = TrainingState(folder, parts, self.buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
+        self.state = TrainingState(folder, parts, buffer, origin | made_for, keep=keep, with_buffer=with_buffer)
         self.check = functools.partial(check_violations, world=config.env, safety=config.safety, folder=folder)
         self.learns_from = config.train.warmup_frames
         self.progress = ""
@@ -119,54 +117,48 @@ class TrainingRun:
         if self.recorder.evaluated(found.metrics | {"filter": found.statistics}):
             self.state.save_best()
 
-    def take(self, counted: Counted, batch: TensorDictBase, steps: TensorDictBase, rewards: Tensor) -> None:
-        """Take in a collected batch: check it and store its transitions.
-
-        Args:
-            counted: what was found in it.
-            batch: ``(num_envs, T)``.
-            steps: ``(M,)``, what :class:`agents.pipeline.MultiStep` made of it.
-            rewards: ``(num_envs, T, N, 1)``, those of the objective.
+    def take(self, counted: Counted) -> None:
+        """Take in what was found in a collected batch, and check it.
 
         Raises:
             DivergedError: if an observation, action or reward is not finite.
             ViolationError: at a violation behind the certified filter.
         """
-        if self.recorder.update(batch, counted):
-            self.check(batch)
-            check_batch(batch, self.recorder.frames)
-        if len(steps):
-            store(self.buffer, steps)
-        self.batch, self.rewards = batch, rewards
+        if self.recorder.update(counted):
+            self.check(counted.batch)
+            check_batch(counted.batch, self.recorder.frames)
+        self.counted = counted
 
     @property
     def learns(self) -> bool:
-        """Whether warm-up is over (and the run has not failed)."""
-        return self.error is None and self.recorder.frames >= self.learns_from and len(self.buffer) > 0
+        """Whether warm-up is over with the batch that is stored, and not yet taken in (and the run has not failed)."""
+        frames = self.recorder.frames + self.config.collector.frames_per_batch
+        return self.error is None and frames >= self.learns_from and len(self.buffer) > 0
 
-    def log(self, losses: dict[str, Tensor], seconds: Seconds, k: int) -> None:
-        """Add a point to the curves if one is due.
+    def log(self, reward: float, losses: dict[str, float], seconds: Seconds) -> None:
+        """Add a point to the curves.
 
         Args:
+            reward: mean of the batch, of the objective.
             losses: of :func:`agents.maddpg.update_step`.
             seconds: where the program's time went.
-            k: which of several learners this one is.
 
         Raises:
             DivergedError: if a loss is not finite.
         """
         frames = self.recorder.frames
-        if not self.clocks["log"](frames):
-            return
-        scalars = self.recorder.scalars() | {"train/noise": self.noise.sigma}
-        scalars["train/reward"] = float(self.rewards.mean())  # the objective's
-        numbers = {name: float(value[k] if value.dim() else value) for name, value in losses.items()}
-        check_finite(numbers, frames)
-        scalars |= {f"loss/{name}": value for name, value in numbers.items()}
+        check_finite(losses, frames)
+        scalars = self.recorder.scalars() | {"train/noise": self.noise.sigma, "train/reward": reward}
+        scalars |= {f"loss/{name}": value for name, value in losses.items()}
         self.board.scalars(scalars | seconds.scalars(frames), frames)
         if self.config.log.histograms:
-            self.board.histogram("train/energy", self.batch["next"][keys.ENERGY], frames)
+            self.board.histogram("train/energy", self.counted.batch["next"][keys.ENERGY], frames)
         self.progress = self.recorder.progress(scalars)
+
+    @property
+    def logs(self) -> bool:
+        """Whether a point of the curves is due; asking starts the next interval."""
+        return self.clocks["log"](self.recorder.frames)
 
     @property
     def ends(self) -> bool:

@@ -3,16 +3,16 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from agents.evaluation import Evaluator, rollout_steps
 from agents.incident import broken_promises
-from agents.pipeline import draw
+from agents.recorder import Seconds
+from agents.replay import Replay
 from agents.run import FAILURES, TrainingRun
 from agents.training_state import valid_ages
 
@@ -120,6 +120,25 @@ def evaluate(runs: Sequence[TrainingRun], evaluator: Evaluator, policy: TensorDi
     for_each(runs, TrainingRun.take_evaluation, found)
 
 
+def log(runs: Sequence[TrainingRun], rewards: Tensor, losses: Mapping[str, Tensor], seconds: Seconds) -> None:
+    """Add a point to the curves of all runs if one is due; their numbers are read at once.
+
+    Args:
+        runs: the program's runs.
+        rewards: of the objective, ``(n_runs * num_envs, T, N, 1)``.
+        losses: of :func:`agents.maddpg.update_step`, of all learners.
+        seconds: where the program's time went.
+    """
+    due = [run.logs for run in runs]
+    if not any(due):
+        return
+    means = torch.stack([own.mean() for own in rewards.chunk(len(runs))])
+    values = [value.double().expand(len(runs)) for value in losses.values()]
+    reward, *rest = torch.stack([means.double(), *values]).tolist()
+    numbers = [dict(zip(losses, own, strict=True)) for own in zip(*rest, strict=True)] or [{} for _ in runs]
+    for_each(runs, TrainingRun.log, reward, numbers, [seconds] * len(runs))
+
+
 def stopped_at(runs: Sequence[TrainingRun]) -> str:
     """How far a program is that was asked to stop, and where its checkpoints are, for the message."""
     good = [run for run in runs if run.error is None]
@@ -128,25 +147,14 @@ def stopped_at(runs: Sequence[TrainingRun]) -> str:
     return f"at {good[0].recorder.frames} frames, checkpoint written in {where}{lost}"
 
 
-def shares(rows: TensorDictBase | Tensor, runs: Sequence[TrainingRun]) -> Sequence:
-    """Each run's part of ``rows``, which hold the runs' worlds one after the other."""
-    return rows.chunk(len(runs)) if len(runs) > 1 and len(rows) else [rows] * len(runs)
+def minibatches(replay: Replay, count: int, batch_size: int, reads: Sequence[NestedKey]) -> Iterator[TensorDictBase]:
+    """Transitions for so many updates: ``(batch_size,)`` each of the only run, ``(K, batch_size)`` of several.
 
-
-def minibatches(runs: Sequence[TrainingRun], count: int) -> Iterator[TensorDictBase]:
-    """Transitions for so many updates: ``(batch,)`` each of the only run, ``(K, batch)`` of several."""
+    Many are drawn as one: the same as one after the other, in less time.
+    """
     for first in range(0, count, MOST_AT_ONCE):
         some = min(MOST_AT_ONCE, count - first)
-        samples = [_sample(run, some) if run.error is None else None for run in runs]
-        stand_in = next(sample for sample in samples if sample is not None)  # for failed runs, whose networks are lost
-        parts = [stand_in if sample is None else sample for sample in samples]
-        whole = cast(TensorDictBase, parts[0] if len(runs) == 1 else torch.stack(parts))  # pyright: ignore[reportCallIssue, reportArgumentType]
-        yield from whole.split(runs[0].batch_size, dim=-1)
-
-
-def _sample(run: TrainingRun, count: int) -> TensorDictBase:
-    """``count`` minibatches, drawn as one: the same as one after the other, in less time."""
-    return draw(run.buffer, count * run.batch_size, run.learner.loss.reads)
+        yield from replay.draw(some * batch_size, reads).split(batch_size, dim=-1)
 
 
 def errors_by_seed(error: Exception, seeds: Iterable[int]) -> dict[int, str]:

@@ -12,7 +12,6 @@ from agents.maddpg import check_loss
 from agents.pipeline import pick_device
 from envs import SurveillanceConfig
 from envs.config import check_choice, check_range
-from envs.graphs import check_graphs
 from safety import SafetyConfig
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -218,9 +217,9 @@ class Config:
     a GPU then does not wait within a step. Slower on a CPU. Where no closed form solves a program the robot holds, and where
     the shield would act all robots of that world drive home."""
     cuda_graphs: bool = False
-    """Record what networks, filter, step, counting and update launch on a GPU once, and launch it as one from then on. Needs
-    fixed_sizes. The same results to rounding. On a CPU nothing is recorded (the optimiser is the fused one, other roundings);
-    with safety.in_loss the update is not."""
+    """Record what networks, filter, step, counting and update launch on a GPU once, and launch it as one from then on: several
+    times as fast. It comes with fixed_sizes. The same results to rounding. On a CPU nothing is recorded (the optimiser is the
+    fused one, other roundings); with safety.in_loss the update is not."""
     debug: bool = False
     """Show tracebacks."""
     env: SurveillanceConfig = field(default_factory=SurveillanceConfig)
@@ -249,8 +248,7 @@ class Config:
                 "worker steps as many worlds as the others."
             )
         self.safety.gains(self.env)
-        self.safety.check_sizes(fixed_sizes=self.fixed_sizes)
-        check_graphs(cuda_graphs=self.cuda_graphs, fixed_sizes=self.fixed_sizes)
+        self.safety.check_sizes(fixed_sizes=self.computing["fixed_sizes"])
         check_loss(self.agent, self.safety)
         steps = self.collector.total_frames // self.collector.num_envs
         if steps < self.agent.n_steps:
@@ -264,8 +262,13 @@ class Config:
     @property
     def computing(self) -> dict[str, bool]:
         """How worlds and filter compute: arguments of :class:`envs.SurveillanceEnv` and ``make_policies``."""
-        sizes = {"fixed_sizes": self.fixed_sizes, "cuda_graphs": self.cuda_graphs}
+        sizes = {"fixed_sizes": self.fixed_sizes or self.cuda_graphs, "cuda_graphs": self.cuda_graphs}
         return {"compile_functions": self.compile} | sizes
+
+    @property
+    def batch_size(self) -> int:
+        """Transitions of an update: a minibatch, or one per agent."""
+        return self.buffer.batch_size * (self.env.n_agents if self.agent.minibatch == "per_agent" else 1)
 
     @property
     def all_seeds(self) -> list[int]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.data import TensorDictReplayBuffer
 
 from agents.checkpoint import (
     FORMAT,
@@ -21,6 +20,7 @@ from agents.checkpoint import (
     save_checkpoint,
     set_aside,
 )
+from agents.replay import ReplayOfLearner
 from agents.replay_files import ReplayFiles
 
 MAY_DIFFER = ("collector.total_frames", "train", "eval", "compile", "fixed_sizes", "cuda_graphs")
@@ -45,7 +45,7 @@ class TrainingState:
         self,
         folder: Path,
         parts: Mapping[str, Any],
-        buffer: TensorDictReplayBuffer,
+        buffer: ReplayOfLearner,
         origin: dict,
         *,
         keep: int,

@@ -18,7 +18,8 @@ from torch import Tensor
 from agents.config import AgentConfig
 from agents.networks import make_actor, make_policies
 from agents.noise import noises_of
-from agents.pipeline import COLLECTOR_OPTIONS, InferenceCollector, flat, use_threads
+from agents.pipeline import COLLECTOR_OPTIONS, InferenceCollector, use_threads
+from agents.replay import flat
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig
 

@@ -7,7 +7,6 @@ from agents.controllers import CONTROLLERS
 from agents.training_config import check_common
 from envs import SurveillanceConfig
 from envs.config import check_choice, check_range
-from envs.graphs import check_graphs
 from envs.video import check_mp4
 from safety import SafetyConfig
 
@@ -53,7 +52,7 @@ class EvaluateConfig:
     fixed_sizes: bool = False
     """As train.py's: let no size of a step depend on the data, for a GPU."""
     cuda_graphs: bool = False
-    """As train.py's: record what filter and step launch on a GPU, and launch it as one; needs fixed_sizes."""
+    """As train.py's: record what filter and step launch on a GPU, and launch it as one. It comes with fixed_sizes."""
     resume: str = "never"
     """auto: an evaluation that has its eval.json is left alone, so that a killed sweep goes on. never: evaluate anew."""
     debug: bool = False
@@ -64,7 +63,6 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         """Check every field."""
         check_common(self.seed, self.device, self.threads)
-        check_graphs(cuda_graphs=self.cuda_graphs, fixed_sizes=self.fixed_sizes)
         check_range("steps", self.steps, 0, 10**9)
         check_range("num_envs", self.num_envs, 1, 10**6)
         check_choice("resume", self.resume, ("auto", "never"))

@@ -42,7 +42,8 @@ def hashed_config(cfg: DictConfig) -> dict:
     found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
     workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
     kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
-    fixed = {name: True for name in COMPUTED if found.pop(name, False)}
+    graphs = bool(found.get("cuda_graphs"))  # which come with fixed sizes
+    fixed = {name: True for name in COMPUTED if found.pop(name, False) or graphs}
     return found | kept | fixed
 
 

@@ -100,7 +100,7 @@ class SafetyConfig:
             raise ValueError(
                 f"fixed_sizes=true needs the exact solver and a problem per robot: safety.split={self.split} "
                 f"safety.solver={self.solver} iterate until all problems are solved. Set safety.split=auto "
-                "safety.solver=auto, or fixed_sizes=false."
+                "safety.solver=auto, or fixed_sizes=false cuda_graphs=false."
             )
 
     def gains(self, world: SurveillanceConfig) -> Gains:

@@ -64,13 +64,16 @@ class FilterStatistics:
         self.max_residual = state["max_residual"]
 
 
-def filter_numbers(tensordict: TensorDictBase, max_speed: float, alive: Tensor | None = None) -> dict[str, Tensor]:
-    """What :meth:`FilterStatistics.add` takes, each ``()`` float64: the device is not waited for.
+def filter_numbers(
+    tensordict: TensorDictBase, max_speed: float, alive: Tensor | None = None, n_blocks: int = 1
+) -> dict[str, Tensor]:
+    """What :meth:`FilterStatistics.add` takes of each block, ``(n_blocks,)`` float64: the device is not waited for.
 
     Args:
         tensordict: holds the filter's diagnostics, ``(*B, N)`` and ``(*B, N, 1)``, of any batch shape.
         max_speed: unit of the intervention threshold, m/s.
         alive: ``(*B, 1)`` bool, worlds that count; all if not given.
+        n_blocks: equal blocks of worlds.
     """
     status, level = tensordict[keys.STATUS], tensordict[keys.LEVEL]
     correction, residual = tensordict[keys.CORRECTION].squeeze(-1), tensordict[keys.RESIDUAL].squeeze(-1)
@@ -85,10 +88,12 @@ def filter_numbers(tensordict: TensorDictBase, max_speed: float, alive: Tensor |
         counts & tensordict[keys.OUTSIDE],
         counts & (level == HOMING),
     )
-    found: dict[str, Tensor] = dict(zip(SUMS, (row.sum(dtype=torch.float64) for row in rows), strict=True))
-    found["max_residual"] = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0).max().double()
+    sums = (row.reshape(n_blocks, -1).sum(-1, dtype=torch.float64) for row in rows)
+    found: dict[str, Tensor] = dict(zip(SUMS, sums, strict=True))
+    solved = torch.where(counts & (status == QPStatus.SOLVED), residual, 0.0)
+    found["max_residual"] = solved.reshape(n_blocks, -1).amax(-1).double()
     margins = {name: tensordict.get(key, None) for name, key in MARGINS.items()}
     for name, x in margins.items():
         if x is not None:
-            found[name] = torch.where(counts, x.squeeze(-1), torch.inf).min().double()
+            found[name] = torch.where(counts, x.squeeze(-1), torch.inf).reshape(n_blocks, -1).amin(-1).double()
     return found

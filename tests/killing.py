@@ -144,11 +144,11 @@ def _arm(stage: str, count: int, by: int) -> None:
         die(stage == "in set-aside")
         return found
 
-    def patched_update(self, batch, counted, update=TrainingRecorder.update):
+    def patched_update(self, counted, update=TrainingRecorder.update):
         die(stage == "in training")
         die(stage == "in a worker", _worker)
         die(stage == "in a Ray worker", _worker_of_ray)
-        return update(self, batch, counted)
+        return update(self, counted)
 
     TrainingRecorder.update = patched_update
     torch.save, Path.replace, Path.rename, Path.rmdir = patched_save, patched_replace, patched_rename, patched_rmdir

@@ -8,7 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.data import LazyTensorStorage
 
 from agents import make_controller
 from agents.config import AgentConfig
@@ -19,8 +18,9 @@ from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies
 from agents.noise import ExplorationNoise
-from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.pipeline import MultiStep, to_transitions
 from agents.recorder import BatchCounter, TrainingRecorder
+from agents.replay import Replay
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.blocks import WorldBlock
@@ -84,7 +84,8 @@ class ReadsZeros(torch.overrides.TorchFunctionMode):
         self.count, self.truth = 0, truth
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        if (func in self.READS or func is torch.Tensor.cpu) and args[0].device == META:
+        to_host = func is torch.Tensor.cpu or (func is torch.Tensor.to and args[1] == "cpu")
+        if (func in self.READS or to_host) and args[0].device == META:
             self.count += 1
             read = torch.zeros(args[0].shape, dtype=args[0].dtype)
             args = (read | self.truth if read.dtype == torch.bool else read,)
@@ -96,7 +97,6 @@ def generators(monkeypatch):
     monkeypatch.setattr(torch, "Generator", AskedGenerator)
     monkeypatch.setattr(Density, "reference_cost", lambda self: 1.0)  # a number, read once at the start
     monkeypatch.setattr(torch.Tensor, "is_set_to", lambda *_: False)  # of TorchRL's targets
-    monkeypatch.setattr(LazyTensorStorage, "_set_last_cursor", lambda *_: None)  # read by TorchRL: storing's only wait
     with DrawsOnItsDevice():
         yield
 
@@ -157,15 +157,12 @@ def test_steps_replay_and_updates(name, noise):
     batch, learner = roll_out(world, config, 8)
     assert on_the_stand_in(batch)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma)
-    buffer = make_buffer(1000, META, 0)
+    replay = Replay(1000, [0], META)
     for part in batch.split(2, dim=1):
-        steps = multi_step(to_transitions(part, violation_penalty=1.0))
-        if len(steps):
-            store(buffer, steps)
-    assert len(buffer) == 4 * (8 - config.agent.n_steps + 1)
-    rows = draw(buffer, 64, learner.loss.reads)
+        replay.store(multi_step(to_transitions(part, violation_penalty=1.0)))
+    assert len(replay.parts[0]) == 4 * (8 - config.agent.n_steps + 1)
+    rows = replay.draw(64, learner.loss.reads)
     assert on_the_stand_in(rows)
-    assert on_the_stand_in(buffer.sample(8))
     losses = update_step(rows, *learner.updates, config.agent)
     assert all(loss.device == META for loss in losses.values())
 
@@ -203,7 +200,7 @@ def test_counting_and_checking_a_batch(name, tmp_path):
     counter, recorder = BatchCounter(world), TrainingRecorder(world, 4, META)
     for step in batch.split(1, dim=1):
         with ReadsZeros(truth=False) as reads:
-            recorder.update(step, *counter(step))
+            recorder.update(*counter(step))
             check_violations(step, world=world, safety=SafetyConfig(), folder=tmp_path)
         assert reads.count == 2
         with ReadsZeros(truth=True):

@@ -65,7 +65,7 @@ def test_the_filter_agrees_with_the_processor(device, n_agents, fixed_sizes):
 @pytest.mark.parametrize("in_loss", [False, True])
 def test_an_update_agrees_with_the_processor(device, in_loss):
     batch, config = collected("cpu", safety=SafetyConfig(in_loss=in_loss), agent=AgentConfig(n_steps=1))
-    rows = to_transitions(batch).reshape(-1)[:256]
+    rows = to_transitions(batch).reshape(-1)[:256].clone()  # for gradients
     n_observation, found = SurveillanceEnv(config.env).n_observation, []
     for place in ("cpu", device):
         _, learner = make_learners(

@@ -5,6 +5,7 @@ import copy
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
@@ -15,9 +16,12 @@ from agents.evaluation import Evaluator
 from agents.learners import make_learners, make_update
 from agents.networks import acting, make_actor, make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.pipeline import MultiStep, to_transitions
 from agents.recorder import BatchCounter, TrainingRecorder
+from agents.replay import Replay
+from agents.seeds import minibatches
 from agents.training_config import Config
+from conf.naming import config_hash
 from envs import SurveillanceConfig, SurveillanceEnv, graphs, keys, metrics
 from envs.dynamics import other_indices, own_pairs, pair_indices
 from envs.graphs import MOST, WARM_UP, Graphed
@@ -155,18 +159,18 @@ def trained(
     update = make_update(learner, agent, config.safety, cuda_graphs=on)
     _, explore = make_policies(learner.actor, world, config.safety, agent, seeds, device, **config.computing)
     collection = make_collection(config, seeds, learners, explore, noises_of(explore), device, print)
-    buffer, multi_step = make_buffer(1000, device, 0), MultiStep(agent.n_steps, agent.gamma)
+    replay, multi_step = Replay(1000, seeds, device), MultiStep(agent.n_steps, agent.gamma)
     counter = BatchCounter(world, n_seeds, cuda_graphs=on)
     recorders = [TrainingRecorder(world, 4, device) for _ in seeds]
     found: dict[str, torch.Tensor] = {}
     for k, batch in enumerate(collection.batches(4 * n_seeds * iterations, resumed=False)):
-        for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
-            recorder.update(own, counted)
-        rows = to_transitions(batch)
-        if len(steps := multi_step(rows)):
-            store(buffer, steps)
-            minibatch = draw(buffer, 8 * n_seeds * (3 if agent.minibatch == "per_agent" else 1), learner.loss.reads)
-            losses = update(minibatch.reshape(n_seeds, -1) if n_seeds > 1 else minibatch)
+        for recorder, counted in zip(recorders, counter(batch), strict=True):
+            recorder.update(counted)
+        replay.store(multi_step(to_transitions(batch)))
+        if len(replay.parts[0]):
+            losses = update(
+                minibatches(replay, 2, 8 * (3 if agent.minibatch == "per_agent" else 1), learner.loss.reads)
+            )
             found |= {f"{k} {name}": value for name, value in losses.items()}
         found |= {f"{k} {name}": value.clone() for name, value in batch.flatten_keys().items()}
     for seed, recorder in zip(seeds, recorders, strict=True):
@@ -178,22 +182,22 @@ def trained(
 @pytest.mark.parametrize(
     ("settings", "recordings"),
     [
-        ({}, 5),
-        ({"n_seeds": 2, "agent": AgentConfig(n_steps=1)}, 5),
-        ({"agent": AgentConfig(n_steps=1, share_params=False, minibatch="per_agent", max_grad_norm=1.0)}, 5),
-        ({"env": SurveillanceConfig(n_agents=5, dimension=3, horizon=6, on_violation="continue")}, 5),
-        ({"env": SurveillanceConfig(density="moving", observe_centroid=True)}, 5),
-        ({"safety": SafetyConfig(split="half")}, 5),
+        ({}, 6),
+        ({"n_seeds": 2, "agent": AgentConfig(n_steps=1)}, 6),
+        ({"agent": AgentConfig(n_steps=1, share_params=False, minibatch="per_agent", max_grad_norm=1.0)}, 6),
+        ({"env": SurveillanceConfig(n_agents=5, dimension=3, horizon=6, on_violation="continue")}, 6),
+        ({"env": SurveillanceConfig(density="moving", observe_centroid=True)}, 6),
+        ({"safety": SafetyConfig(split="half")}, 6),
         ({"safety": SafetyConfig(in_loss=True), "agent": AgentConfig(n_steps=1)}, 4),
-        ({"safety": SafetyConfig(mode="paper")}, 5),
-        ({"safety": SafetyConfig(mode="none")}, 5),
-        ({"safety": SafetyConfig(mode="dalal", dalal_steps=3)}, 5),
+        ({"safety": SafetyConfig(mode="paper")}, 6),
+        ({"safety": SafetyConfig(mode="none")}, 6),
+        ({"safety": SafetyConfig(mode="dalal", dalal_steps=3)}, 6),
     ],
     ids=["default", "seeds", "own networks", "space", "moving", "half", "in loss", "paper", "none", "dalal"],
 )
 def test_training_is_the_same(recording, settings, recordings):
     found = trained(16, **settings)
-    assert StandInRecording.made == recordings  # actor, filter, step, counting and update
+    assert StandInRecording.made == recordings  # actor, filter, step, counting, update, measured update
     assert StandInRecording.replays >= 6 * recordings
     expected = trained(16, on=False, **settings)
     assert not [name for name, value in expected.items() if not torch.equal(found[name], value)]
@@ -237,12 +241,10 @@ def test_optimisers_go_on_from_checkpoints_of_the_other_kind(seeds, first):
         return parts, whole, make_update(whole, agent, safety)
 
     parts, whole, update = made(on=first)
-    for _ in range(4):
-        update(batch)
+    update([batch] * 4)
     whole.share_moments()
     saved = [copy.deepcopy({"loss": part.loss.state_dict(), **states(part)}) for part in parts]
-    for _ in range(3):
-        update(batch)
+    update([batch] * 3)
     others, other, go_on = made(on=not first)
     for part, content in zip(others, saved, strict=True):
         part.loss.load_state_dict(content["loss"])
@@ -250,8 +252,7 @@ def test_optimisers_go_on_from_checkpoints_of_the_other_kind(seeds, first):
             optimizer.load_state_dict(content[name])
             assert bool(optimizer.param_groups[0]["fused"]) != first
     other.gather_moments()
-    for _ in range(3):
-        go_on(batch)
+    go_on([batch] * 3)
     for mine, theirs in zip(whole.loss.parameters(), other.loss.parameters(), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-6)
 
@@ -295,7 +296,14 @@ def test_graphs_need_fixed_sizes():
     for make in (
         lambda: SurveillanceEnv(cuda_graphs=True),
         lambda: SafetyFilter(SafetyConfig(), SurveillanceConfig(), cuda_graphs=True),
-        lambda: Config(cuda_graphs=True),
     ):
         with pytest.raises(ValueError, match="fixed_sizes=true too"):
             make()
+
+
+def test_graphs_bring_fixed_sizes():
+    assert Config(cuda_graphs=True).computing == Config(fixed_sizes=True, cuda_graphs=True).computing
+    alone, both = OmegaConf.create({"cuda_graphs": True}), OmegaConf.create({"cuda_graphs": True, "fixed_sizes": True})
+    assert config_hash(alone) == config_hash(both)
+    with pytest.raises(ValueError, match="fixed_sizes"):
+        Config(cuda_graphs=True, safety=SafetyConfig(mode="paper", split="joint"))

@@ -5,14 +5,13 @@ import itertools
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, reduce_robots, update_step
 from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
-from agents.pipeline import MultiStep, collect, draw, make_buffer, store, to_transitions
+from agents.pipeline import MultiStep, collect, to_transitions
+from agents.replay import Replay
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig, SafetyFilter
 
@@ -574,52 +573,18 @@ def test_where_rollouts_are_computed(compile_functions):
         assert torch.is_inference_mode_enabled() == (not compile_functions)
 
 
-def test_collected_batches_are_for_gradients_too():
+def test_rows_are_for_gradients_though_rollouts_are_not():
     s = Setup()
     env = SurveillanceEnv(s.world, 4)
     _, explore = make_policies(s.actor, s.world, s.safety, s.agent, 0, torch.device("cpu"))
-    for batch in collect(env, explore, 8, 32):
-        assert env.state["position"].is_inference()
-        assert not any(value.is_inference() for value in batch.values(True, True))
-    s.loss(to_transitions(batch).reshape(-1))["loss_value"].sum().backward()
-    assert all(p.grad is not None for p in s.loss.value_network_params.values(True, True))
-    assert not env.reset()[keys.OBSERVATION].is_inference()
-
-
-def test_buffer_samples_by_its_own_seed():
-    data = TensorDict({"x": torch.arange(50.0)}, [50])
-    samples = []
-    for seed in (3, 3, 4):
-        torch.manual_seed(seed + len(samples))
-        buffer = make_buffer(100, torch.device("cpu"), seed)
-        buffer.extend(data)
-        samples.append(buffer.sample(16)["x"])
-    assert torch.equal(samples[0], samples[1])
-    assert not torch.equal(samples[0], samples[2])
-
-
-@pytest.mark.parametrize("capacity", [7, 10, 64])
-def test_rows_written_as_slices_lie_where_torchrl_puts_them(capacity):
-    generator = torch.Generator().manual_seed(0)
-    mine, theirs = (
-        make_buffer(capacity, torch.device("cpu"), 0),
-        TensorDictReplayBuffer(storage=LazyTensorStorage(capacity)),
-    )
-    for _ in range(30):
-        count = int(torch.randint(1, 8, (), generator=generator))
-        rows = TensorDict(
-            {
-                "a": torch.randn(count, 2, generator=generator),
-                "next": {"b": torch.randn(count, generator=generator) > 0},
-            },
-            [count],
-        )
-        store(mine, rows.clone())
-        theirs.extend(rows.clone())
-        assert len(mine) == len(theirs)
-        assert mine.writer.state_dict() == theirs.writer.state_dict()
-        assert (mine.storage.get(slice(0, len(mine))) == theirs.storage.get(slice(0, len(mine)))).all()
-        sample, own = theirs[: len(mine)], draw(mine, 4, ["a", ("next", "b")])
-        assert set(own.keys(True, True)) == {"a", ("next", "b")}
-        for a, b in zip(own["a"], own["next", "b"], strict=True):
-            assert b == sample["next", "b"][(sample["a"] == a).all(-1)]
+    for steps in (1, 2):
+        replay = Replay(100, [0], torch.device("cpu"))
+        for batch in collect(env, explore, 4 * steps, 4 * steps):
+            assert env.state["position"].is_inference()
+            assert batch.shape == (4, steps)
+            replay.store(to_transitions(batch).reshape(-1))
+        rows = replay.draw(16, list(replay.tensors))
+        assert not any(value.is_inference() for value in rows.values(True, True))
+        s.loss(rows)["loss_value"].sum().backward()
+        assert all(p.grad is not None for p in s.loss.value_network_params.values(True, True))
+        assert not env.reset()[keys.OBSERVATION].is_inference()

@@ -49,7 +49,7 @@ class Look:
         self.counter, self.recorder = counter, TrainingRecorder(world, 1, None)
 
     def __call__(self, batch):
-        return self.recorder.update(batch, *self.counter(batch))
+        return self.recorder.update(*self.counter(batch))
 
 
 def test_a_batch_with_something_wrong_is_to_be_looked_at():
@@ -78,7 +78,9 @@ def test_several_learners_are_counted_as_each_alone():
     for counted, batch in zip(together, batches, strict=True):
         (alone,) = BatchCounter(world)(batch)
         assert counted.sums == alone.sums
-        assert torch.equal(counted.violating, alone.violating)
+        for name in ("violating", "reward", "done"):
+            assert torch.equal(getattr(counted, name), getattr(alone, name))
+        assert (counted.batch == batch).all()
     assert [counted.sums["collision"] for counted in together] == [0, 2, 4]
 
 
@@ -88,7 +90,7 @@ def test_a_robot_that_violates_twice_in_one_step_is_one_violating_robot_step():
     flags = {kind: batch[("next", *keys.VIOLATION, kind)] for kind in keys.VIOLATION_KINDS}
     flags["depleted"][0, 1, 0] = flags["stranded"][0, 1, 0] = True  # robot 0 at the second step, twice at once
     flags["collision"][0, 1] = True  # and both robots collide
-    recorder.update(batch, *BatchCounter(world)(batch))
+    recorder.update(*BatchCounter(world)(batch))
     assert recorder.violations == {"depleted": 1, "stranded": 1, "overcharged": 0, "collision": 2}
     assert recorder.episodes.finished == {"return": [-1.0], "violations": [2.0]}
     assert recorder.summary()["frames"] == 2

@@ -19,8 +19,9 @@ from agents.learners import make_learners
 from agents.maddpg import update_step
 from agents.networks import make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, store, to_transitions
+from agents.pipeline import MultiStep, to_transitions
 from agents.recorder import BatchCounter, TrainingRecorder
+from agents.replay import Replay
 from agents.training_config import Config
 from envs import SurveillanceConfig, SurveillanceEnv
 from safety import SafetyConfig, SafetyFilter
@@ -77,7 +78,7 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
     noises = noises_of(explore)
     collection = make_collection(config, seeds, learners, explore, noises, CPU, print)
     batches = collection.batches(100 * num_envs * n_seeds, resumed=False)
-    multi_step, buffer = MultiStep(config.agent.n_steps, config.agent.gamma), make_buffer(10**4, CPU, 0)
+    multi_step, replay = MultiStep(config.agent.n_steps, config.agent.gamma), Replay(10**4, seeds, CPU)
     counter, counts = BatchCounter(world, n_seeds), dict.fromkeys(MOST, 0.0)
     recorders = [TrainingRecorder(world, num_envs, CPU) for _ in seeds]
     mode = Waits()
@@ -94,19 +95,14 @@ def waits(world: SurveillanceConfig, num_envs: int, *, fixed_sizes: bool = False
         with mode, readings:
             batch = next(batches)
             spent("collect")
-            for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
-                recorder.update(own, counted)
+            for recorder, counted in zip(recorders, counter(batch), strict=True):
+                recorder.update(counted)
             spent("count")
-            steps = multi_step(to_transitions(batch))
-            if len(steps):
-                store(buffer, steps)
+            replay.store(multi_step(to_transitions(batch)))
             spent("store")
         if k >= 8:
             with mode, readings:
-                minibatch = draw(buffer, 256, learner.loss.reads)
-                update_step(
-                    torch.stack([minibatch] * n_seeds) if n_seeds > 1 else minibatch, *learner.updates, config.agent
-                )
+                update_step(replay.draw(256, learner.loss.reads), *learner.updates, config.agent)
             spent("update")
             steps = [state["step"] for own in learner.optimizers.values() for state in own.state.values()]
             mode.on_host = {id(step): step for step in steps}

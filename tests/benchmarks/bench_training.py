@@ -54,8 +54,10 @@ from agents.incident import check_violations
 from agents.learners import make_learners, make_update
 from agents.networks import make_policies
 from agents.noise import noises_of
-from agents.pipeline import MultiStep, draw, make_buffer, pick_device, store, to_transitions, use_threads
+from agents.pipeline import MultiStep, pick_device, to_transitions, use_threads
 from agents.recorder import BatchCounter, Seconds, TrainingRecorder
+from agents.replay import Replay
+from agents.seeds import minibatches
 from agents.training_config import Config
 from conf.schema import register, to_config
 from envs import SurveillanceEnv
@@ -75,8 +77,8 @@ class Contestant:
         frames: frames of a batch.
         updates: updates per batch.
         store: takes a batch in.
-        sample: draws a minibatch.
-        update: learns from one.
+        samples: draws minibatches.
+        update: learns from them.
         end: called after the updates of a batch.
         count: counts and checks a batch.
         device: waited for at the end of each part.
@@ -88,15 +90,15 @@ class Contestant:
         frames: int,
         updates: int,
         store: Callable[[TensorDictBase], object],
-        sample: Callable[[], TensorDictBase],
-        update: Callable[[TensorDictBase], object],
+        samples: Callable[[], Iterator[TensorDictBase]],
+        update: Callable[[Iterator[TensorDictBase]], object],
         end: Callable[[], object] = lambda: None,
         count: Callable[[TensorDictBase], object] = lambda batch: None,
         device: str = "cpu",
     ) -> None:
         self.device = device
         self.batches, self.frames, self.updates = batches, frames, updates
-        self.store, self.sample, self.update = store, sample, update
+        self.store, self.samples, self.update = store, samples, update
         self.end, self.count = end, count
 
     def run(self, batches: int) -> dict[str, float]:
@@ -110,6 +112,12 @@ class Contestant:
             spent[part] += now - mark
             mark = now
 
+        def drawn() -> Iterator[TensorDictBase]:
+            for minibatch in self.samples():
+                done("sample")
+                yield minibatch
+                done("update")
+
         for _ in range(batches):
             batch = next(self.batches)
             done("collect")
@@ -117,11 +125,7 @@ class Contestant:
             done("count")
             self.store(batch)
             done("store")
-            for _ in range(self.updates):
-                minibatch = self.sample()
-                done("sample")
-                self.update(minibatch)
-                done("update")
+            self.update(drawn())
             self.end()
             done("update")
         return {part: seconds / (batches * self.frames) for part, seconds in spent.items()}
@@ -198,13 +202,17 @@ def baseline(config: Config, steps: int) -> Contestant:
     loss.make_value_estimator(ValueEstimators.TD0, gamma=agent.gamma)
     target, optimizer = SoftUpdate(loss, tau=agent.tau), torch.optim.Adam(loss.parameters(), lr=agent.actor_lr)
 
-    def update(minibatch: TensorDictBase) -> None:
-        losses = loss(minibatch)
-        (losses["loss_actor"] + losses["loss_value"]).backward()
-        nn.utils.clip_grad_norm_(loss.parameters(), 40.0)
-        optimizer.step()
-        optimizer.zero_grad()
-        target.step()
+    def samples() -> Iterator[TensorDictBase]:
+        return (buffer.sample() for _ in range(updates))
+
+    def update(minibatches: Iterator[TensorDictBase]) -> None:
+        for minibatch in minibatches:
+            losses = loss(minibatch)
+            (losses["loss_actor"] + losses["loss_value"]).backward()
+            nn.utils.clip_grad_norm_(loss.parameters(), 40.0)
+            optimizer.step()
+            optimizer.zero_grad()
+            target.step()
 
     def end() -> None:
         noise.step(frames)
@@ -213,8 +221,7 @@ def baseline(config: Config, steps: int) -> Contestant:
     def store(batch: TensorDictBase) -> None:
         buffer.extend(batch.reshape(-1))
 
-    parts = (store, buffer.sample, update, end)
-    return Contestant(iter(collector), frames, updates, *parts, device=device.type)
+    return Contestant(iter(collector), frames, updates, store, samples, update, end, device=device.type)
 
 
 # ---- ours -----------------------------------------------------------------------------------------------------------
@@ -231,8 +238,7 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
     noises = noises_of(explore)
     collection = make_collection(config, seeds, learners, explore, noises, device, print)
     multi_step = MultiStep(config.agent.n_steps, config.agent.gamma, n_blocks=n_seeds)
-    minibatch = config.buffer.batch_size
-    buffers = [make_buffer(config.buffer.capacity, device, seed) for seed in seeds]
+    replay = Replay(config.buffer.capacity, seeds, device)
     counter = BatchCounter(config.env, n_seeds, **graphs)
     recorders = [TrainingRecorder(config.env, worlds, device) for _ in seeds]
     folder = Path(tempfile.gettempdir())  # of violation.json; a violation ends the program
@@ -242,32 +248,25 @@ def ours(config: Config, n_seeds: int = 1) -> tuple[Contestant, Seconds]:
 
     def count(batch: TensorDictBase) -> None:
         seconds.spent("collect")
-        for recorder, own, counted in zip(recorders, batch.chunk(n_seeds), counter(batch), strict=True):
-            if recorder.update(own, counted):
-                check_violations(own, world=config.env, safety=config.safety, folder=folder)
-                check_batch(own, recorder.frames)
+        for recorder, counted in zip(recorders, counter(batch), strict=True):
+            if recorder.update(counted):
+                check_violations(counted.batch, world=config.env, safety=config.safety, folder=folder)
+                check_batch(counted.batch, recorder.frames)
 
     def keep(batch: TensorDictBase) -> None:
-        steps = multi_step(to_transitions(batch, config.train.violation_penalty))
-        if len(steps):
-            for buffer, own in zip(buffers, steps.chunk(n_seeds), strict=True):
-                store(buffer, own)
+        replay.store(multi_step(to_transitions(batch, config.train.violation_penalty)))
 
-    per_batch, updates = n_seeds * config.collector.frames_per_batch, config.train.n_updates
-    drawn: list[TensorDictBase] = []
+    def samples() -> Iterator[TensorDictBase]:
+        return minibatches(replay, config.train.n_updates, config.batch_size, learner.loss.reads)
 
-    def sample() -> TensorDictBase:
-        if not drawn:  # all of a batch at once, as agents.seeds.minibatches
-            samples = [draw(buffer, updates * minibatch, learner.loss.reads) for buffer in buffers]
-            whole = samples[0] if n_seeds == 1 else torch.stack(samples)
-            drawn.extend(reversed(whole.split(minibatch, dim=-1)))
-        return drawn.pop()
-
+    per_batch = n_seeds * config.collector.frames_per_batch
     batches = collection.batches(10**6 * per_batch, resumed=False)
     for _ in range(config.agent.n_steps):  # the buffers are not empty when the updates begin
         keep(next(batches))
 
-    contestant = Contestant(batches, per_batch, updates, keep, sample, update, count=count, device=device.type)
+    contestant = Contestant(
+        batches, per_batch, config.train.n_updates, keep, samples, update, count=count, device=device.type
+    )
     return contestant, seconds
 
 

@@ -18,7 +18,8 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 from agents import AgentConfig
 from agents.maddpg import make_loss, make_optimizers, update_step
 from agents.networks import STATE_ACTION_VALUE, make_actor, make_critic, make_policies
-from agents.pipeline import collect, make_buffer, to_transitions
+from agents.pipeline import collect, to_transitions
+from agents.replay import Replay
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from safety import SafetyConfig
 
@@ -90,11 +91,12 @@ def training_rows(world: SurveillanceConfig, options, budget: harness.Budget) ->
         _, explore = make_policies(actor, world, safety, agent, 0, env.device)
         collector = collect(env, explore, frames, -1)
         collectors.append(collector)
-        buffer, batches = make_buffer(100_000, env.device, 0), iter(collector)
+        replay, batches = Replay(100_000, [0], torch.device(options.device)), iter(collector)
 
-        def learn(batch: TensorDictBase, buffer=buffer, update=update) -> None:
-            buffer.extend(to_transitions(batch).reshape(-1))
-            update(buffer.sample(options.batches[0]))
+        def learn(batch: TensorDictBase, replay=replay, update=update) -> None:
+            rows = to_transitions(batch).reshape(-1)
+            replay.store(rows)
+            update(replay.draw(options.batches[0], list(rows.keys(True, True))))
 
         chains[name] = (lambda batches=batches: next(batches), learn)
     times = budget.medians(chains, frames, ("training", world.n_agents))
