@@ -130,11 +130,16 @@ def test_training_by_graphs_is_the_same(n_seeds, split, monkeypatch):
             made.append(self)
 
     monkeypatch.setattr(graphs, "CudaRecording", Counted)
-    found = trained(16, n_seeds, torch.device("cuda"), **settings)
-    assert len(made) == 5  # actor, filter, step, counting and update
-    expected = trained(16, n_seeds, torch.device("cuda"), on=False, **settings)
-    # not to the bit: cuBLAS rounds differently on other streams, and Adam's first steps make 2e-4 of a rounding (seen on a CPU)
-    torch.testing.assert_close(found, expected, rtol=1e-2, atol=1e-3, equal_nan=True)
+    found = trained(12, n_seeds, torch.device("cuda"), **settings)
+    assert len(made) == 6  # actor, filter, step, counting, update, measured update
+    expected = trained(12, n_seeds, torch.device("cuda"), on=False, **settings)
+    assert found.keys() == expected.keys()
+    mine, theirs = (torch.cat([own[name].double().flatten() for name in expected]) for own in (found, expected))
+    difference = torch.where(mine.isnan() & theirs.isnan(), 0.0, (mine - theirs).abs())
+    # not to the bit: cuBLAS rounds differently on other streams, and Adam's first steps follow the signs of tiny gradients. On a
+    # CPU 0.998 are as close where weights begin 1e-6 apart (5e-3 at most), and 0.93 where one of the 24 updates is missed (0.09)
+    assert (difference <= 3e-4 + 1e-2 * theirs.abs()).double().mean() > 0.99
+    assert difference.max() < 0.02
 
 
 @pytest.mark.gpu
