@@ -43,7 +43,7 @@ from conf.naming import hashed_config
 from conf.run_folder import announce_certificate, objective, only_writers, run_folders, unfinished_seeds, write_json
 from conf.schema import Config, register, to_config
 from conf.versions import run_origin
-from envs import SurveillanceEnv, keys
+from envs import SurveillanceEnv
 
 register()
 logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -140,7 +140,7 @@ def train(cfg: DictConfig, config: Config, folders: dict[int, Path], start: int)
             seconds.spent("update")
             for_each(runs, TrainingRun.take, counted)  # checks the batch: a GPU meanwhile goes on with the updates
             seconds.spent("collect")
-            log(runs, transitions["next"][keys.REWARD], losses, seconds)
+            log(runs, transitions["next"], losses, seconds)
             bar.set_postfix_str(runs[0].progress, refresh=False)
             bar.update(batch.numel())
             due = [run.evaluates for run in runs]

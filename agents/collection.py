@@ -69,7 +69,7 @@ def make_collection(
         device: the learner's.
         tell: shows a line to the user.
     """
-    if device.type == "cuda" and not config.cuda_graphs:
+    if device.type == "cuda" and not config.cuda_graphs and not config.workers.count and config.safety.may_fix_sizes:
         tell("a GPU waits for the launch of each small kernel: cuda_graphs=true is several times as fast.")
     if not config.workers.count:
         return LocalCollection(config, seeds, explore_policy, device)

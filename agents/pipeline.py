@@ -91,8 +91,8 @@ def collect(
 ) -> Generator[TensorDictBase, None, None]:
     """Batches ``(num_envs, T)`` of TorchRL's collector; warm-up uses the policy, never the environment's random action.
 
-    They are inference tensors: whoever differentiates what comes from a batch itself, and not from rows that were stored or
-    cloned, is told so by PyTorch.
+    Where nothing is compiled they are inference tensors: whoever differentiates what comes from a batch itself, and not from
+    rows that were stored or cloned, is told so by PyTorch.
 
     Args:
         env: the worlds, closed at the end.

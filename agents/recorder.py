@@ -201,7 +201,7 @@ class BatchCounter:
         following = batch["next"]
         flags = [following[(*keys.VIOLATION, kind)].squeeze(-1) for kind in keys.VIOLATION_KINDS]
         found = {kind: blocks(flag).sum(-1) for kind, flag in zip(keys.VIOLATION_KINDS, flags, strict=True)}
-        found["cost"] = blocks(following[keys.COVERAGE_COST]).sum(-1)
+        found["cost"] = blocks(following[keys.COVERAGE_COST]).sum(-1, dtype=torch.float64)
         found["done"] = blocks(following["done"]).any(-1)
         # finite only if all terms are; an overflow is looked at more closely
         found["finite"] = torch.stack([blocks(batch[key]).sum(-1) for key in WATCHED.values()]).isfinite().all(0)

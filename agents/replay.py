@@ -22,6 +22,8 @@ class Replay:
         self.capacity, self.device = capacity, device
         self.tensors: dict[tuple[str, ...], Tensor] = {}
         """By key, ``(learners, capacity, ...)``; made when the first transitions come."""
+        self._kinds: dict[tuple[str, ...], tuple] = {}
+        """Shape and type of a transition's entry."""
         self.parts = [ReplayOfLearner(self, k, seed) for k, seed in enumerate(seeds)]
 
     def store(self, rows: TensorDictBase) -> None:
@@ -61,14 +63,16 @@ class Replay:
 
     def _write(self, block: slice, written: int, new: dict[tuple[str, ...], Tensor]) -> None:
         """Write rows ``(learners, M, ...)`` of a block that has had ``written`` before."""
+        kinds = {key: (value.shape[2:], value.dtype) for key, value in new.items()}
         if not self.tensors:
-            for key, value in new.items():
-                shape = (len(self.parts), self.capacity, *value.shape[2:])
-                self.tensors[key] = torch.empty(shape, dtype=value.dtype, device=self.device)
-        if self.tensors.keys() != new.keys():
-            differing = ", ".join(".".join(key) for key in sorted(self.tensors.keys() ^ new.keys()))
+            self._kinds = kinds
+            for key, (shape, dtype) in kinds.items():
+                self.tensors[key] = torch.empty(len(self.parts), self.capacity, *shape, dtype=dtype, device=self.device)
+        if kinds != self._kinds:
+            differing = sorted({key for key, _ in kinds.items() ^ self._kinds.items()})
             raise ValueError(
-                f"the replay buffer's transitions always have the same entries; these differ: {differing}."
+                "the replay buffer's transitions always have the same entries of the same shapes and types; these differ: "
+                f"{', '.join('.'.join(key) for key in differing)}."
             )
         count = next(iter(new.values())).shape[1]
         first = max(0, count - self.capacity)

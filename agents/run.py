@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from agents.board import Board
 from agents.checkpoint import CheckpointError
@@ -20,7 +21,6 @@ from agents.recorder import Counted, Every, Seconds, TrainingRecorder
 from agents.replay import ReplayOfLearner
 from agents.training_config import Config
 from agents.training_state import TrainingState
-from envs import keys
 from envs.rendering import save_training_curve
 
 FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
@@ -127,7 +127,6 @@ class TrainingRun:
         if self.recorder.update(counted):
             self.check(counted.batch)
             check_batch(counted.batch, self.recorder.frames)
-        self.counted = counted
 
     @property
     def learns(self) -> bool:
@@ -135,12 +134,13 @@ class TrainingRun:
         frames = self.recorder.frames + self.config.collector.frames_per_batch
         return self.error is None and frames >= self.learns_from and len(self.buffer) > 0
 
-    def log(self, reward: float, losses: dict[str, float], seconds: Seconds) -> None:
+    def log(self, reward: float, losses: dict[str, float], energy: Tensor, seconds: Seconds) -> None:
         """Add a point to the curves.
 
         Args:
             reward: mean of the batch, of the objective.
             losses: of :func:`agents.maddpg.update_step`.
+            energy: of the batch's robots, of any shape.
             seconds: where the program's time went.
 
         Raises:
@@ -152,7 +152,7 @@ class TrainingRun:
         scalars |= {f"loss/{name}": value for name, value in losses.items()}
         self.board.scalars(scalars | seconds.scalars(frames), frames)
         if self.config.log.histograms:
-            self.board.histogram("train/energy", self.counted.batch["next"][keys.ENERGY], frames)
+            self.board.histogram("train/energy", energy, frames)
         self.progress = self.recorder.progress(scalars)
 
     @property

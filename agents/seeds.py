@@ -15,6 +15,7 @@ from agents.recorder import Seconds
 from agents.replay import Replay
 from agents.run import FAILURES, TrainingRun
 from agents.training_state import valid_ages
+from envs import keys
 
 MOST_AT_ONCE = 16
 """Minibatches that are drawn at a time."""
@@ -120,23 +121,24 @@ def evaluate(runs: Sequence[TrainingRun], evaluator: Evaluator, policy: TensorDi
     for_each(runs, TrainingRun.take_evaluation, found)
 
 
-def log(runs: Sequence[TrainingRun], rewards: Tensor, losses: Mapping[str, Tensor], seconds: Seconds) -> None:
+def log(runs: Sequence[TrainingRun], following: TensorDictBase, losses: Mapping[str, Tensor], seconds: Seconds) -> None:
     """Add a point to the curves of all runs if one is due; their numbers are read at once.
 
     Args:
         runs: the program's runs.
-        rewards: of the objective, ``(n_runs * num_envs, T, N, 1)``.
+        following: "next" of the batch's transitions with the rewards of the objective, ``(n_runs * num_envs, T)``.
         losses: of :func:`agents.maddpg.update_step`, of all learners.
         seconds: where the program's time went.
     """
     due = [run.logs for run in runs]
     if not any(due):
         return
-    means = torch.stack([own.mean() for own in rewards.chunk(len(runs))])
+    means = torch.stack([own.mean() for own in following[keys.REWARD].chunk(len(runs))])
     values = [value.double().expand(len(runs)) for value in losses.values()]
     reward, *rest = torch.stack([means.double(), *values]).tolist()
     numbers = [dict(zip(losses, own, strict=True)) for own in zip(*rest, strict=True)] or [{} for _ in runs]
-    for_each(runs, TrainingRun.log, reward, numbers, [seconds] * len(runs))
+    energy = following[keys.ENERGY].chunk(len(runs))
+    for_each(runs, TrainingRun.log, reward, numbers, energy, [seconds] * len(runs))
 
 
 def stopped_at(runs: Sequence[TrainingRun]) -> str:

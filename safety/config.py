@@ -92,11 +92,14 @@ class SafetyConfig:
                 "choose safety.solver=active_set or safety.split=half."
             )
 
+    @property
+    def may_fix_sizes(self) -> bool:
+        """Whether the filter can work at fixed sizes."""
+        return self.mode in ("dalal", "none") or (self.split != "joint" and self.solver in ("auto", "exact"))
+
     def check_sizes(self, *, fixed_sizes: bool) -> None:
         """Raise a ``ValueError`` if the filter cannot work at fixed sizes and is asked to."""
-        if not fixed_sizes or self.mode in ("dalal", "none"):
-            return
-        if self.split == "joint" or self.solver not in ("auto", "exact"):
+        if fixed_sizes and not self.may_fix_sizes:
             raise ValueError(
                 f"fixed_sizes=true needs the exact solver and a problem per robot: safety.split={self.split} "
                 f"safety.solver={self.solver} iterate until all problems are solved. Set safety.split=auto "

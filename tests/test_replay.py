@@ -87,8 +87,14 @@ def test_nothing_is_no_transition():
 def test_transitions_with_other_entries_are_refused():
     replay = Replay(5, [0], CPU)
     replay.store(rows(2, None))
-    with pytest.raises(ValueError, match=r"the same entries; these differ: c, next\.b\."):
-        replay.store(rows(2, None).exclude(("next", "b")).set("c", torch.zeros(2)))
+    for others, differing in (
+        (rows(2, None).exclude(("next", "b")).set("c", torch.zeros(2)), "c, next.b"),
+        (rows(2, None).set("a", torch.zeros(2, 1)), "a"),
+        (rows(2, None).set("a", torch.zeros(2, 2, dtype=torch.float64)), "a"),
+    ):
+        with pytest.raises(ValueError, match=f"the same entries .*; these differ: {differing}"):
+            replay.store(others)
+    assert replay.parts[0].written == 2
 
 
 def test_each_learner_draws_by_a_stream_of_its_own():

@@ -15,6 +15,7 @@ from agents.incident import ViolationError
 from agents.learners import LearnerStack, make_learner, make_learners
 from agents.maddpg import clip_gradients, update_step
 from agents.networks import make_policies
+from agents.pipeline import InferenceCollector
 from agents.report_runs import find_runs
 from agents.run import TrainingRun
 from agents.seeds import equally_far
@@ -96,14 +97,26 @@ def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(
     (first,) = runs.glob("*_seed0")
     before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
 
-    def take(self, counted, real=TrainingRun.take):
-        if self.seed == 2 and self.recorder.frames >= 128:
-            with torch.inference_mode():  # as it was collected
-                counted.batch["next"][keys.REWARD].fill_(torch.nan)
-            counted.sums = counted.sums | {"finite": 0.0}
-        real(self, counted)
+    bad = []
 
-    monkeypatch.setattr(TrainingRun, "take", take)
+    def init(self, *arguments, real=TrainingRun.__init__, **options):
+        real(self, *arguments, **options)
+        if self.seed == 2:
+            bad.append(self)
+
+    def rollout(self, real=InferenceCollector.rollout):
+        batch = real(self)
+        for own in bad:
+            if own.worlds.env is self.env and own.recorder.frames >= 128:
+                with torch.inference_mode():  # as it was collected
+                    batch["next"][keys.REWARD][own.worlds.worlds].fill_(torch.nan)
+        return batch
+
+    def break_seed_2():
+        monkeypatch.setattr(TrainingRun, "__init__", init)
+        monkeypatch.setattr(InferenceCollector, "rollout", rollout)
+
+    break_seed_2()
     code, output = program(train.main, *QUIET, "n_seeds=4")
     assert code == 1
     error = output[output.index("error:") :].splitlines()
@@ -113,10 +126,17 @@ def test_finished_seeds_are_left_alone_and_a_failed_one_does_not_end_the_others(
     assert before == {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
     finished = {path.parent.name[-1] for path in runs.glob("*_seed?/summary.json")}
     assert finished == {"0", "1", "3"}
+    (failed,) = runs.glob(
+        "*_seed2"
+    )  # the replay holds what was not a number by then, and the networks have learned from it
+    kept = [
+        load_checkpoint(path) for path in [*checkpoints(failed / "checkpoints"), failed / "checkpoints" / "best.pt"]
+    ]
+    assert max(content["frames"] for content in kept) <= 128
     assert [path.name for path in runs.glob("*_seeds*")] == [f"{first.name.split('_')[0]}_seeds0-3"]
     assert not differences(alone[1], compared(next(runs.glob("*_seed1"))))
 
-    monkeypatch.setattr(TrainingRun, "take", take)
+    break_seed_2()
     code, output = program(train.main, *QUIET, "seeds=[4,2]")  # the others do not wait for it
     assert code == 1
     assert "1 of 2 seeds failed: 2." in output

@@ -216,7 +216,24 @@ def test_a_bad_job_of_a_multirun_leaves_the_others_alone(program, tmp_path):
     assert len(list(tmp_path.glob("runs/*/*/summary.json"))) == 1
 
 
-@pytest.mark.parametrize("sizes", [(), ("fixed_sizes=true", "cuda_graphs=true")], ids=["", "graphs"])
+def test_an_evaluation_by_graphs_has_fixed_sizes(program, tmp_path, monkeypatch):
+    monkeypatch.setattr(graphs, "recorder_for", lambda tensor: StandInRecording)
+    short = ("controller=random", "env=five_robots", "steps=8", "num_envs=4", "pictures=false", "device=cpu")
+    found = []
+    for sizes in ("cuda_graphs=true", "fixed_sizes=true"):
+        code, output = program(evaluate.main, *short, sizes, "resume=never")
+        assert code == 0, output
+        (path,) = tmp_path.glob("runs/**/eval.json")
+        found.append(json.loads(path.read_text()))
+        path.unlink()
+    assert [content["fixed_sizes"] for content in found] == [True, True]
+    assert found[0]["coverage_cost"] == found[1]["coverage_cost"]
+    code, output = program(evaluate.main, *short, "cuda_graphs=true", "safety=half", "safety.split=joint")
+    assert code == 1
+    assert "fixed_sizes=false cuda_graphs=false" in " ".join(output.split())
+
+
+@pytest.mark.parametrize("sizes", [(), ("cuda_graphs=true",)], ids=["", "graphs"])
 def test_training_stops_at_a_broken_promise(program, tmp_path, monkeypatch, sizes):
     """A shield that lets everybody meet in the middle. Evaluations, which would find it first, are left out."""
 

@@ -3,7 +3,7 @@
 Training as a whole against TorchRL's MADDPG on VMAS simple_spread (needs vmas: ``pip install -e .[bench]``), 3 robots, one
 process, the contestants in turn, medians of the rounds. One round of each is ``--steps`` vector steps of its worlds and
 ``train.n_updates`` updates per vector step; ten seeds take a fifth as many. Other words are overrides of
-train.py, such as ``device=cuda fixed_sizes=true cuda_graphs=true``: all contestants are then on the GPU.
+train.py, such as ``device=cuda cuda_graphs=true``: all contestants are then on the GPU.
 
 The baseline does what TorchRL's sota-implementations/multiagent/maddpg_iddpg.py does, written anew from the public interfaces
 of TorchRL: VmasEnv with RewardSum, MultiAgentMLP actor (TanhDelta, AdditiveGaussianModule) and centralised critic, Collector,
