@@ -3,12 +3,14 @@
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
+from torch.utils.tensorboard.summary import histogram, hparams
 
 from envs.animation import Painter, write_gif
 from envs.path_plot import path_figure
@@ -40,17 +42,20 @@ class Board:
         """Whether evaluations are to keep a world's history."""
         return self.figures or self.gif
 
-    def scalars(self, values: Mapping[str, float], frames: int) -> None:
-        """Log numbers by tag, as one event: TensorBoard opens the file anew for each."""
-        found = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
-        self.writer._get_file_writer().add_summary(Summary(value=found), frames)
+    def point(
+        self, values: Mapping[str, float], frames: int, histograms: Mapping[str, Tensor] = MappingProxyType({})
+    ) -> None:
+        """Log numbers and histograms, of all entries that are finite, by tag.
 
-    def histogram(self, tag: str, values: Tensor, frames: int) -> None:
-        """Log a histogram of all entries that are finite."""
-        values = values.detach().flatten()
-        values = values[values.isfinite()]
-        if values.numel():
-            self.writer.add_histogram(tag, values.cpu(), frames, bins=50)  # pyright: ignore[reportArgumentType]
+        All are one event: TensorBoard opens the file anew for each, in a thread that takes the interpreter from the training.
+        """
+        found = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
+        for tag, tensor in histograms.items():
+            numbers = tensor.detach().cpu().numpy()
+            numbers = numbers[np.isfinite(numbers)]
+            if numbers.size:
+                found += histogram(tag, numbers, bins=50).value
+        self.writer._get_file_writer().add_summary(Summary(value=found), frames)
 
     def world(self, trajectory: Trajectory | None, frames: int) -> None:
         """Log the paths and the animation of one world."""

@@ -112,7 +112,7 @@ class TrainingRun:
 
     def take_evaluation(self, found: Evaluation) -> None:
         """Log what came of the policy's rollout; the best policy so far is kept."""
-        self.board.scalars(evaluation_scalars(found.metrics), self.recorder.frames)
+        self.board.point(evaluation_scalars(found.metrics), self.recorder.frames)
         self.board.world(found.trajectory, self.recorder.frames)
         if self.recorder.evaluated(found.metrics | {"filter": found.statistics}):
             self.state.save_best()
@@ -150,9 +150,8 @@ class TrainingRun:
         check_finite(losses, frames)
         scalars = self.recorder.scalars() | {"train/noise": self.noise.sigma, "train/reward": reward}
         scalars |= {f"loss/{name}": value for name, value in losses.items()}
-        self.board.scalars(scalars | seconds.scalars(frames), frames)
-        if self.config.log.histograms:
-            self.board.histogram("train/energy", energy, frames)
+        histograms = {"train/energy": energy} if self.config.log.histograms else {}
+        self.board.point(scalars | seconds.scalars(frames), frames, histograms)
         self.progress = self.recorder.progress(scalars)
 
     @property

@@ -137,7 +137,7 @@ def log(runs: Sequence[TrainingRun], following: TensorDictBase, losses: Mapping[
     values = [value.double().expand(len(runs)) for value in losses.values()]
     reward, *rest = torch.stack([means.double(), *values]).tolist()
     numbers = [dict(zip(losses, own, strict=True)) for own in zip(*rest, strict=True)] or [{} for _ in runs]
-    energy = following[keys.ENERGY].chunk(len(runs))
+    energy = following[keys.ENERGY].cpu().chunk(len(runs))
     for_each(runs, TrainingRun.log, reward, numbers, energy, [seconds] * len(runs))
 
 

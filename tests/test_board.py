@@ -101,7 +101,7 @@ def test_settings_that_differ_come_first_in_the_table(tmp_path):
         board = Board(
             tmp_path / str(k), 0, {"a": 1, "seed": k, "x": {"rate": rate}, "z": "y"}, figures=False, gif=False
         )
-        board.scalars({"eval/coverage_cost": 0.3 + k, "train/return": -1.0}, 10)
+        board.point({"eval/coverage_cost": 0.3 + k, "train/return": -1.0}, 10)
         board.close()
     multiplexer = EventMultiplexer().AddRunsFromDirectory(str(tmp_path)).Reload()
     provider = MultiplexerDataProvider(multiplexer, str(tmp_path))
@@ -126,9 +126,9 @@ def test_points_of_a_killed_process_disappear(tmp_path):
     for resumed_at, until in ((0, 8), (4, 6)):
         board = Board(tmp_path, resumed_at, {"a": {"b": [1]}}, figures=False, gif=False)
         for frames in range(resumed_at + 1, until + 1):
-            board.scalars({"x": 10.0 * resumed_at + frames}, frames)
-        board.histogram("h", torch.tensor([1.0, float("nan"), 2.0]), until)
-        board.histogram("h", torch.tensor([float("nan")]), until)
+            board.point({"x": 10.0 * resumed_at + frames}, frames)
+        board.point({}, until, {"h": torch.tensor([1.0, float("nan"), 2.0])})
+        board.point({}, until, {"h": torch.tensor([float("nan")])})
         board.world(None, until)
         board.close()
     events = read(tmp_path)
