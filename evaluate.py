@@ -28,6 +28,7 @@ from agents.pipeline import pick_device, use_threads
 from conf.callbacks import one_clear_error
 from conf.command_line import clear_errors
 from conf.evaluate_schema import EvaluateConfig
+from conf.naming import COMPUTED
 from conf.run_folder import announce_certificate, finished_evaluation, write_json
 from conf.schema import Config, register, run_config, to_config
 from conf.versions import git_hash
@@ -54,8 +55,8 @@ def main(cfg: DictConfig) -> None:
     source = config if config.run is None else run_config(cfg, list(HydraConfig.get().overrides.task))
     world: SurveillanceConfig = source.env
     safety: SafetyConfig = source.safety
-    sizes = {"fixed_sizes": config.fixed_sizes or config.cuda_graphs, "cuda_graphs": config.cuda_graphs}
-    env = SurveillanceEnv(world, config.num_envs, device, env_seed, compile_functions=config.compile, **sizes)
+    sizes = {name: config.computing[name] for name in COMPUTED}
+    env = SurveillanceEnv(world, config.num_envs, device, env_seed, **config.computing)
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)

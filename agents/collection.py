@@ -69,9 +69,9 @@ def make_collection(
         device: the learner's.
         tell: shows a line to the user.
     """
-    if device.type == "cuda" and not config.cuda_graphs and not config.workers.count and config.safety.may_fix_sizes:
-        tell("a GPU waits for the launch of each small kernel: cuda_graphs=true is several times as fast.")
     if not config.workers.count:
+        if device.type == "cuda" and not config.cuda_graphs and config.safety.may_fix_sizes:
+            tell("a GPU waits for the launch of each small kernel: cuda_graphs=true is several times as fast.")
         return LocalCollection(config, seeds, explore_policy, device)
     tasks = [worker_task(config, seeds, k, device) for k in range(config.workers.count)]
 

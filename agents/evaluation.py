@@ -15,7 +15,7 @@ from envs.coverage import powered_coverage_cost
 from envs.graphs import graphed
 from envs.metrics import Charges, minimum_distance
 from envs.rendering import Trajectory
-from safety.statistics import MARGINS, SUMS, FilterStatistics, filter_numbers
+from safety.statistics import FILTER_READS, MARGINS, SUMS, FilterStatistics, filter_numbers
 
 RECORD_LIMIT = 2000  # samples of the recorded world by default; longer rollouts keep every n-th
 
@@ -26,8 +26,7 @@ def rollout_steps(horizon: int) -> int:
 
 
 READ: list[NestedKey] = [
-    *(keys.POSITION, keys.ENERGY, *MARGINS.values()),
-    *(keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE),
+    *(keys.POSITION, keys.ENERGY, *FILTER_READS),
     *(("next", *key) for key in (keys.POSITION, keys.ENERGY, keys.REWARD)),
     *(("next", key) for key in (keys.COVERAGE_COST, keys.DENSITY, "terminated")),
     *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),

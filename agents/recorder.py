@@ -13,10 +13,10 @@ from agents.divergence import WATCHED
 from envs import SurveillanceConfig, keys
 from envs.graphs import graphed
 from envs.metrics import EpisodeTracker
-from safety.statistics import MARGINS, FilterStatistics, filter_numbers
+from safety.statistics import FILTER_READS, FilterStatistics, filter_numbers
 
 COUNTED: list[NestedKey] = [
-    *(*WATCHED.values(), keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE, *MARGINS.values()),
+    *(*WATCHED.values(), *FILTER_READS),
     *(("next", *keys.VIOLATION, kind) for kind in keys.VIOLATION_KINDS),
     *(("next", keys.COVERAGE_COST), ("next", "done")),
 ]

@@ -1,6 +1,6 @@
 """Uniform replay of several learners in one set of tensors: stored and drawn for all at once, by random streams of their own."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -36,8 +36,10 @@ class Replay:
         if not count:
             return
         new = {key: value.unflatten(0, (len(self.parts), count)) for key, value in flat(rows).items()}
-        together = len({part.written for part in self.parts}) == 1
-        for block, written in [(slice(None), self.parts[0].written)] if together else self._blocks():
+        blocks = [(part.block, part.written) for part in self.parts]
+        if len({part.written for part in self.parts}) == 1:  # not where one has gone on with an empty buffer
+            blocks = [(slice(None), self.parts[0].written)]
+        for block, written in blocks:
             self._write(block, written, {key: value[block] for key, value in new.items()})
         for part in self.parts:
             part.written += count
@@ -55,11 +57,6 @@ class Replay:
             rows = self.tensors[(key,) if isinstance(key, str) else key].flatten(0, 1).index_select(0, index)
             found[key] = rows.unflatten(0, shape)
         return TensorDict(found, shape, self.device)
-
-    def _blocks(self) -> Iterator[tuple[slice, int]]:
-        """Each learner's block and number of rows: they differ where one has gone on with an empty buffer."""
-        for part in self.parts:
-            yield slice(part.k, part.k + 1), part.written
 
     def _write(self, block: slice, written: int, new: dict[tuple[str, ...], Tensor]) -> None:
         """Write rows ``(learners, M, ...)`` of a block that has had ``written`` before."""
@@ -94,7 +91,7 @@ class ReplayOfLearner:
     """
 
     def __init__(self, replay: Replay, k: int, seed: int) -> None:
-        self.replay, self.k = replay, k
+        self.replay, self.k, self.block = replay, k, slice(k, k + 1)
         self.written = 0
         """Transitions stored so far, those included that have been overwritten."""
         self.generator = torch.Generator(device=replay.device).manual_seed(seed)  # draws rows where they lie
@@ -118,7 +115,7 @@ class ReplayOfLearner:
         """Hold the transitions up to the ``written``-th ever stored, ``rows`` ``(M,)``, M at most the capacity."""
         if rows is not None:
             new = {key: value.to(self.replay.device).unsqueeze(0) for key, value in flat(rows).items()}
-            self.replay._write(slice(self.k, self.k + 1), written - len(rows), new)
+            self.replay._write(self.block, written - len(rows), new)
         self.written = written
 
 

@@ -262,8 +262,7 @@ class Config:
     @property
     def computing(self) -> dict[str, bool]:
         """How worlds and filter compute: arguments of :class:`envs.SurveillanceEnv` and ``make_policies``."""
-        sizes = {"fixed_sizes": self.fixed_sizes or self.cuda_graphs, "cuda_graphs": self.cuda_graphs}
-        return {"compile_functions": self.compile} | sizes
+        return computing(self.compile, fixed_sizes=self.fixed_sizes, cuda_graphs=self.cuda_graphs)
 
     @property
     def batch_size(self) -> int:
@@ -306,6 +305,12 @@ def seeds_of(config: Any) -> list[int]:
     if config.seeds:
         return list(config.seeds)
     return [config.seed + k for k in range(max(1, config.n_seeds))]
+
+
+def computing(compile_functions: bool, *, fixed_sizes: bool, cuda_graphs: bool) -> dict[str, bool]:
+    """How worlds and filter compute, for a program's settings: graphs come with fixed sizes."""
+    sizes = {"fixed_sizes": fixed_sizes or cuda_graphs, "cuda_graphs": cuda_graphs}
+    return {"compile_functions": compile_functions} | sizes
 
 
 def check_common(seed: int, device: str, threads: int) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from agents.controllers import CONTROLLERS
-from agents.training_config import check_common
+from agents.training_config import check_common, computing
 from envs import SurveillanceConfig
 from envs.config import check_choice, check_range
 from envs.video import check_mp4
@@ -88,3 +88,8 @@ class EvaluateConfig:
                     f"{name}={folder} is not the folder of a run: {folder}/.hydra/config.yaml does not exist."
                 )
         self.safety.gains(self.env)
+
+    @property
+    def computing(self) -> dict[str, bool]:
+        """How worlds and filter compute, as :attr:`agents.training_config.Config.computing`."""
+        return computing(self.compile, fixed_sizes=self.fixed_sizes, cuda_graphs=self.cuda_graphs)

@@ -91,7 +91,7 @@ def check_evaluation(cfg: DictConfig) -> None:
     """Raise what is wrong with an evaluation before anything is written: values, run folder, checkpoint, its world."""
     config = to_config(cfg)
     source = config if config.run is None else run_config(cfg, list(cfg.hydra.overrides.task))
-    source.safety.check_sizes(fixed_sizes=config.fixed_sizes or config.cuda_graphs)
+    source.safety.check_sizes(fixed_sizes=config.computing["fixed_sizes"])
     if config.adversary is not None:
         trained = OmegaConf.load(Path(config.adversary) / ".hydra" / "config.yaml")
         objective = OmegaConf.select(trained, "train.objective")

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from envs import keys
@@ -17,6 +17,11 @@ MARGINS = {
     "min_certificate_margin": keys.BARRIER_CERTIFICATE,
 }
 """Least barriers by name: survivability and overcharge (energy), collision (m^2), G - Delta_G (m)."""
+FILTER_READS: list[NestedKey] = [
+    *(keys.STATUS, keys.LEVEL, keys.CORRECTION, keys.RESIDUAL, keys.OUTSIDE),
+    *MARGINS.values(),
+]
+"""What :func:`filter_numbers` reads; some filters do not write all barriers."""
 SUMS = ("robot_steps", "interventions", "correction", "fallbacks", "infeasible", "inaccurate", "outside", "homing")
 
 
