@@ -10,22 +10,26 @@ from torch import Tensor
 T = TypeVar("T")
 
 TINY_SQUARE = 1e-37  # below it a squared length is 0
+CUT_SPEED = 1 - 7e-7
+"""Share of the limit that faster velocities are cut to: by less than a correction counts from (1e-6, :mod:`safety.statistics`)."""
+FULL_SPEED = 1 - 3.7e-7
+"""Share of the limit up to which a filter leaves a velocity as it is. Two orders of summation of a float32 norm differ by less than
+the rest, so whoever checks an executed speed finds it within the limit; and a velocity that was cut is not cut again."""
 
 
-def limit_speed(velocity: Tensor, max_speed: float) -> Tensor:
-    """Scale velocities outside the speed ball onto it; others are returned bit for bit.
+def limit_speed(velocity: Tensor, max_speed: float, full: float = 1.0) -> Tensor:
+    """Scale velocities outside the speed ball into it; others are returned bit for bit.
 
     Args:
         velocity: ``(*B, N, d)``, m/s.
         max_speed: radius of the ball, m/s.
+        full: share of ``max_speed`` above which a velocity is scaled, at least :data:`FULL_SPEED`.
 
     Returns:
-        ``(*B, N, d)``, m/s, norm at most ``max_speed`` (to a rounding: where it is the limit, another order of
-        summation may find the next number).
+        ``(*B, N, d)``, m/s, norm at most ``max_speed``: to a rounding, whatever the order of summation with ``FULL_SPEED``.
     """
     speed = length(velocity).unsqueeze(-1)
-    # Cut to a hair below the limit: rounding must not lift a norm above it, and a velocity cut once is not cut again.
-    return torch.where(speed > max_speed, velocity * (max_speed * (1 - 1e-6) / speed), velocity)
+    return torch.where(speed > max_speed * full, velocity * (max_speed * CUT_SPEED / speed), velocity)
 
 
 def integrate(position: Tensor, velocity: Tensor, dt: float) -> Tensor:

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from envs.battery import charging_field
 from envs.config import SurveillanceConfig
-from envs.dynamics import length, limit_speed, other_indices
+from envs.dynamics import FULL_SPEED, length, limit_speed, other_indices
 from envs.starts import draw_starts
 from envs.transition import transition
 from safety.barriers import BarrierRow, literal_geometry, literature_barriers
@@ -234,7 +234,7 @@ class DalalLayer:
         nominal = torch.cat([target / self.world.max_speed, torch.ones_like(energy).unsqueeze(-1)], dim=-1)
         correction = closed_form(nominal, gain, value)
         # in m/s: a target without correction stays as it is to the last bit
-        action = limit_speed(target - self.world.max_speed * correction[..., :-1], self.world.max_speed)
+        action = limit_speed(target - self.world.max_speed * correction[..., :-1], self.world.max_speed, FULL_SPEED)
         return action, (1 - correction[..., -1]).clamp(0, 1), torch.zeros_like(slot), torch.zeros_like(energy)
 
     def linear_model(self, position: Tensor, energy: Tensor, slot: Tensor, *rows: BarrierRow) -> tuple[Tensor, Tensor]:

@@ -27,7 +27,7 @@ from envs import keys
 from envs.battery import charge, charging_field
 from envs.compilation import compiled
 from envs.config import SurveillanceConfig
-from envs.dynamics import components_first, limit_speed
+from envs.dynamics import FULL_SPEED, components_first, limit_speed
 from envs.graphs import check_graphs, graphed
 from envs.transition import transition
 from safety.barriers import (
@@ -140,7 +140,7 @@ class SafetyFilter(TensorDictModuleBase):
         nominal, energy = components_first(nominal.to(position.dtype)), energy.to(position.dtype)
         position = components_first(position)
         finite = nominal.isfinite().all(dim=-1)
-        target = limit_speed(torch.where(finite.unsqueeze(-1), nominal, 0.0), self.world.max_speed)
+        target = limit_speed(torch.where(finite.unsqueeze(-1), nominal, 0.0), self.world.max_speed, FULL_SPEED)
         if self.safety.mode == "certified":
             action, current, status, residual, level, *diagnostics = self._certified(
                 target, finite, position, energy, slot
@@ -150,7 +150,7 @@ class SafetyFilter(TensorDictModuleBase):
             diagnostics = [h_c.value, h_o.value, h_s.value.amin(dim=-1)]
             diagnostics.append(~(torch.stack(diagnostics) >= 0).all(dim=0))
             if self.safety.mode == "none":
-                action = target = limit_speed(nominal, self.world.max_speed)
+                action = target = limit_speed(nominal, self.world.max_speed, FULL_SPEED)
                 current = torch.ones_like(energy)
                 status = level = torch.zeros_like(slot)
                 residual = torch.zeros_like(energy)

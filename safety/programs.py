@@ -6,6 +6,10 @@ from torch import Tensor
 from safety.qp import project_halfspaces_ball, solve_qp
 from safety.speed_faces import face_normals, joint_rows
 
+BALL = 1 - 2.4e-7
+"""The programs' speed limit, share of max_speed: a float32 rounding above every target (:data:`envs.dynamics.FULL_SPEED`), which is
+then within it, and one below max_speed, so that no solution is cut afterwards."""
+
 
 def solve_per_robot(
     target: Tensor, G: Tensor, h: Tensor, max_speed: float, solver: str, *, fixed_sizes: bool
@@ -24,8 +28,7 @@ def solve_per_robot(
         Velocity ``(*B, d)``, status and residual ``(*B,)``.
     """
     if solver in ("auto", "exact"):
-        # half of limit_speed's hair: cut targets stay as they are, and rounding stays inside the ball
-        solution = project_halfspaces_ball(target, G, h, max_speed * (1 - 5e-7), fixed_sizes=fixed_sizes)
+        solution = project_halfspaces_ball(target, G, h, max_speed * BALL, fixed_sizes=fixed_sizes)
         return solution.value, solution.status, solution.residual
     faces, offset = face_normals(target.shape[-1], max_speed, target.dtype, target.device)
     G = torch.cat([G, faces.expand(*G.shape[:-2], *faces.shape)], dim=-2)

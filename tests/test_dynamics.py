@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.dynamics import integrate, limit_speed, other_indices, pair_indices
+from envs.dynamics import FULL_SPEED, integrate, limit_speed, other_indices, pair_indices
+from safety.programs import BALL
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -39,8 +40,35 @@ def test_speeds_outside_land_on_the_sphere_in_the_same_direction(d, dtype):
     assert (speed > 0.2).mean() > 0.9
     got = limit_speed(velocity, 0.2)
     assert got.dtype == dtype
-    np.testing.assert_allclose(got.double().numpy(), expected, rtol=2e-6, atol=0)  # cut a hair (1e-6) below the limit
-    assert got.double().norm(dim=-1).max() <= 0.2  # never above it, not by one rounding
+    np.testing.assert_allclose(got.double().numpy(), expected, rtol=2e-6, atol=0)  # cut a hair below the limit
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("limit", [0.05, 0.2, 0.37, 1.0, 5.0])
+def test_no_speed_is_above_the_limit_whoever_looks_and_no_cut_is_a_correction(d, dtype, limit):
+    velocity = random_velocity(100_000, 2, d, scale=1.0, dtype=dtype)
+    size = velocity.norm(dim=-1, keepdim=True)
+    near = torch.linspace(1 - 2e-6, 1 + 2e-6, len(velocity), dtype=dtype).reshape(-1, 1)
+    velocity[:, 1] *= limit * near / size[:, 1]  # at the limit
+    velocity[:, 0] *= (limit / size[:, 0]).clamp_min(1) * 1.1  # far beyond it
+    got = limit_speed(velocity, limit, FULL_SPEED)
+    x, y = got.numpy()[..., 0], got.numpy()[..., 1:]
+    for speed in (
+        got.norm(dim=-1),
+        (got * got).sum(-1).sqrt(),
+        (got.flip(-1) ** 2).cumsum(-1)[..., -1].sqrt(),
+        torch.from_numpy(np.hypot(x, np.linalg.norm(y, axis=-1))),
+    ):
+        assert (speed <= torch.tensor(limit, dtype=dtype)).all()
+    assert (got.double().norm(dim=-1) <= limit * BALL).all()  # the programs' own limit
+    exact = velocity.double() * (limit / velocity.double().norm(dim=-1, keepdim=True)).clamp_max(1)
+    assert ((got.double() - exact).norm(dim=-1) <= 1e-6 * limit).all()
+    assert torch.equal(limit_speed(got, limit, FULL_SPEED), got)
+    changed = (got != velocity).any(-1)
+    assert changed[:, 0].all()
+    assert changed[:, 1].any()
+    assert not changed[:, 1].all()
 
 
 def test_one_fast_robot_does_not_touch_the_others():
@@ -67,7 +95,7 @@ def test_limit_is_idempotent_bit_for_bit(d, dtype):
 def test_limit_never_exceeds_the_ball(row, max_speed):
     velocity = torch.tensor(row, dtype=torch.float64).reshape(1, 1, 3)
     got = limit_speed(velocity, max_speed)
-    assert float(got.norm()) <= max_speed * (1 + 1e-6)
+    assert float(got.norm()) <= max_speed * (1 + 1e-15)
     assert float((got * velocity).sum()) >= 0
 
 
