@@ -60,10 +60,11 @@ def main(cfg: DictConfig) -> None:
     if isinstance(source, Config):
         checkpoint = find_checkpoint(Path(config.run or ""), config.checkpoint)
         nominal = make_actor(env.n_observation, world, source.agent).to(device)
-        nominal.load_state_dict(load_checkpoint(checkpoint, device)["actor"])
-        name = str(checkpoint)
+        trained = load_checkpoint(checkpoint, device)
+        nominal.load_state_dict(trained["actor"])
+        name, frames = str(checkpoint), trained.get("frames")
     else:
-        name = config.controller or ""
+        name, frames = config.controller or "", None
         nominal = make_controller(name, world, seed=controller_seed, adversary=config.adversary)
     safety_filter = SafetyFilter(safety, world, compile=config.compile, **sizes)
     policy = TensorDictSequential(nominal, safety_filter)
@@ -74,9 +75,10 @@ def main(cfg: DictConfig) -> None:
         "restart": config.restart,
         "seed": config.seed,
         "policy": name,
+        "policy_frames": frames,
     }
-    if config.resume == "auto" and finished_evaluation(folder / "eval.json", asked):
-        tqdm.write(f"{folder}/eval.json exists: nothing to do. resume=never evaluates anew.")
+    if config.resume == "auto" and (message := finished_evaluation(folder / "eval.json", asked)):
+        tqdm.write(message)
         return
     for old in ("eval.json", "violation.json"):
         (folder / old).unlink(missing_ok=True)

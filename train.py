@@ -60,7 +60,8 @@ def main(cfg: DictConfig) -> float | None:
     folders = unfinished_seeds(cfg, config.all_seeds, output, tqdm.write)
     failed: dict[int, str] = {}
     with only_writers(folder for folder in folders.values() if folder != output):
-        for start, group in equally_far(folders, config.resume, tqdm.write) if folders else ():
+        kept = config.checkpoint.buffer
+        for start, group in equally_far(folders, config.resume, tqdm.write, rows=kept) if folders else ():
             try:
                 train(cfg, config, group, start)
             except (SeedsFailedError, *FAILURES) as error:

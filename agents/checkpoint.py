@@ -106,6 +106,15 @@ def keep_newest(folder: Path, keep: int) -> None:
             old.unlink()
 
 
+def is_sound(path: Path) -> bool:
+    """Whether a file is as it was written, by the checksums of its zip archive; ``torch.load`` does not look at them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except Exception:  # damaged archives raise many kinds
+        return False
+
+
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict:
     """Read a checkpoint, every byte of it checked against the checksums that its zip archive holds.
 
@@ -115,9 +124,8 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict:
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist: give the folder of a run that has written one.")
     try:
-        with zipfile.ZipFile(path) as archive:
-            if damaged := archive.testzip():  # torch.load does not look at the checksums
-                raise zipfile.BadZipFile(f"{damaged} is damaged")
+        if not is_sound(path):
+            raise zipfile.BadZipFile
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files
         raise CheckpointError(

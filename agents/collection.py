@@ -69,6 +69,9 @@ def make_collection(
         device: the learner's.
         tell: shows a line to the user.
     """
+    warmup, frames = config.train.warmup_frames, config.collector.total_frames
+    if warmup > frames:
+        tell(f"nothing is learnt: train.warmup_frames={warmup} is more than collector.total_frames={frames}.")
     if not config.workers.count:
         if device.type == "cuda" and not config.cuda_graphs and config.safety.may_fix_sizes:
             tell("a GPU waits for the launch of each small kernel: cuda_graphs=true is several times as fast.")

@@ -46,6 +46,12 @@ class Learner:
         """What :func:`agents.maddpg.update_step` needs."""
         return self.loss, self.optimizers, self.target_updater
 
+    @property
+    def n_updates(self) -> int:
+        """Updates so far, as its critics' optimiser counted them when the moments were last shared."""
+        moments = next(iter(self.optimizers["loss_value"].state.values()), None)
+        return int(moments["step"]) if moments else 0
+
     def gather_moments(self) -> None:
         """Nothing: the optimisers are the learner's own."""
 

@@ -131,6 +131,10 @@ class MADDPGLoss(DDPGLoss):
         action = actor.module(tensordict[keys.OBSERVATION], layers)
         if not self.filtered:
             return action, 0.0
+        if (
+            action.requires_grad
+        ):  # the filter's gradients lie otherwise: sums over them would depend on the number of learners
+            action.register_hook(torch.Tensor.contiguous)
         state = tensordict.select(keys.POSITION, keys.ENERGY, keys.SLOT).set(keys.NOMINAL_ACTION, action)
         state = safety_filter(state)
         return state[keys.ACTION], state[keys.CORRECTION].squeeze(-1)

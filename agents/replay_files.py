@@ -4,12 +4,13 @@ Row k is the k-th transition ever stored. A checkpoint at W rows needs the rows 
 cost of saving grows with what is new, not with the capacity.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
-from agents.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from agents.checkpoint import CheckpointError, is_sound, load_checkpoint, save_checkpoint
 from agents.replay import ReplayOfLearner
 from envs.randomness import restore_generator
 
@@ -41,18 +42,19 @@ class ReplayFiles:
         return {
             "written": written,
             "written_before": self.saved_before,
+            "first": max(0, written - self.capacity),
             "rng": (self.buffer.generator.get_state(), str(self.buffer.replay.device)),
         }
 
     def prune(self) -> None:
         """Delete the files that neither of the last two checkpoints needs."""
-        for path, (_, end) in self._files().items():
+        for path, (_, end) in row_files(self.folder).items():
             if end <= self.saved_before - self.capacity:
                 path.unlink()
 
     def clear(self) -> None:
         """Delete all files: a finished run needs none."""
-        for path in self._files():
+        for path in row_files(self.folder):
             path.unlink()
         if self.folder.is_dir() and not any(self.folder.iterdir()):
             self.folder.rmdir()
@@ -67,29 +69,54 @@ class ReplayFiles:
         Raises:
             CheckpointError: if rows are missing or damaged.
         """
-        written, capacity = state["written"], self.capacity
-        at, parts = max(0, written - capacity), []
-        files = ReplayFiles(source, self.buffer)._files()
-        for path, (start, end) in sorted(files.items(), key=lambda item: item[1]):
-            if start <= at < end <= written:
-                rows = TensorDict(load_checkpoint(path, self.buffer.replay.device)["rows"], [end - start])
-                parts.append(rows[at - start :].exclude("index"))  # which earlier versions saved, too
-                at = end
-        if at < written:
-            raise CheckpointError(
-                f"{source} lacks the replay rows {at} to {written} of this checkpoint. Use a newer checkpoint of an unfinished "
-                "run, or checkpoint.buffer=false: it goes on with an empty replay buffer, so not to the same bits."
-            )
+        written, parts = state["written"], []
+        for path, rows, start in _chain(source, row_files(source), max(0, written - self.capacity), written):
+            whole = TensorDict(load_checkpoint(path, self.buffer.replay.device)["rows"], [rows])
+            parts.append(whole[start:].exclude("index"))  # which earlier versions saved, too
         self.buffer.restore(torch.cat(parts) if parts else None, written)
         restore_generator(self.buffer.generator, state["rng"][0])
         if source != self.folder:  # of another run: the next checkpoint writes all rows into this one's folder
             return
         self.saved, self.saved_before = written, state["written_before"]
-        for path, (_, end) in self._files().items():
+        for path, (_, end) in row_files(self.folder).items():
             if end > written:  # of a checkpoint that was not completed
                 path.unlink()
 
-    def _files(self) -> dict[Path, tuple[int, int]]:
-        """Files with their first row and one past their last row."""
-        found = {path: path.stem.split("_") for path in self.folder.glob("rows_*_*.pt")}
-        return {path: (int(first), int(end)) for path, (_, first, end) in found.items()}
+
+def row_files(folder: Path) -> dict[Path, tuple[int, int]]:
+    """The files of a folder, with their first row and one past their last row."""
+    found = {path: path.stem.split("_") for path in folder.glob("rows_*_*.pt")}
+    return {path: (int(first), int(end)) for path, (_, first, end) in found.items()}
+
+
+def check_rows(state: dict, source: Path, sound: Callable[[Path], bool] = is_sound) -> None:
+    """Refuse a checkpoint whose rows are not all there, without reading them.
+
+    Args:
+        state: what :meth:`ReplayFiles.save` returned.
+        source: folder that the files are in.
+        sound: whether a file is as it was written.
+
+    Raises:
+        CheckpointError: if rows are missing or damaged.
+    """
+    files = {path: rows for path, rows in row_files(source).items() if sound(path)}
+    first = state.get(
+        "first", min((first for first, _ in files.values()), default=0)
+    )  # earlier versions did not save it
+    _chain(source, files, first, state["written"])
+
+
+def _chain(source: Path, files: dict[Path, tuple[int, int]], at: int, end: int) -> list[tuple[Path, int, int]]:
+    """Files that hold the rows from ``at`` to ``end``, in order: each with its number of rows and the first that is needed."""
+    found = []
+    for path, (first, last) in sorted(files.items(), key=lambda item: item[1]):
+        if first <= at < last <= end:
+            found.append((path, last - first, at - first))
+            at = last
+    if at < end:
+        raise CheckpointError(
+            f"{source} lacks the replay rows {at} to {end} of this checkpoint, or their file is damaged. Use another checkpoint of "
+            "an unfinished run, or checkpoint.buffer=false: it goes on with an empty replay buffer, so not to the same bits."
+        )
+    return found

@@ -20,7 +20,7 @@ from agents.pipeline import WaitingSteps
 from agents.recorder import Counted, Every, Seconds, TrainingRecorder
 from agents.replay import ReplayOfLearner
 from agents.training_config import Config
-from agents.training_state import TrainingState
+from agents.training_state import TrainingState, check_frames
 from envs.rendering import save_training_curve
 
 FAILURES = (CheckpointError, DivergedError, ViolationError, OSError)
@@ -101,11 +101,7 @@ class TrainingRun:
             raise CheckpointError(
                 f"seed {self.seed}: its checkpoint of {latest} frames is gone. Start the program again."
             )
-        if self.recorder.frames > self.config.collector.total_frames:
-            raise CheckpointError(
-                f"resume={self.config.resume}: its checkpoint is at {self.recorder.frames} frames, beyond "
-                f"collector.total_frames={self.config.collector.total_frames}: ask for more, or take an older one."
-            )
+        check_frames(self.config.resume, self.recorder.frames, self.config.collector.total_frames)
         self.learns_from += 0 if kept_rows else self.recorder.frames
         log, settings = self.config.log, self.settings | {"seed": self.seed}
         self.board = Board(self.folder, self.recorder.frames, settings, figures=log.figures, gif=log.gif)
@@ -202,5 +198,5 @@ class TrainingRun:
         speed = {"wall_time_s": wall_time, "frames_per_second": frames / wall_time, "time": seconds.totals}
         speed |= {"n_seeds": n_seeds} if n_seeds > 1 else {}
         speed |= {"workers_lost": self.worlds.lost} if isinstance(self.worlds, WorkerBlock) else {}
-        kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}}
+        kept = {"checkpoint": {"buffer": self.config.checkpoint.buffer}, "updates": self.learner.n_updates}
         return self.origin | self.recorder.summary() | speed | kept | {"eval": self.recorder.evaluation}

@@ -41,7 +41,7 @@ class SeedsFailedError(RuntimeError):
 
 
 def equally_far(
-    folders: Mapping[int, Path], resume: str, tell: Callable[[str], None]
+    folders: Mapping[int, Path], resume: str, tell: Callable[[str], None], *, rows: bool
 ) -> list[tuple[int, dict[int, Path]]]:
     """Seeds that can be trained as one batch, because all have a valid checkpoint of the same frames and updates, or none.
 
@@ -52,13 +52,14 @@ def equally_far(
         folders: the folder of each seed's run.
         resume: ``auto``; anything else does not look for checkpoints.
         tell: shows a line for each damaged checkpoint.
+        rows: replay rows are needed too.
 
     Returns:
         Frames to go on from and folders by seed, the largest group first.
     """
     if len(folders) == 1 or resume != "auto":
         return [(0, dict(folders))]
-    ages = {seed: valid_ages(folder / "checkpoints", tell) or {(0, 0)} for seed, folder in folders.items()}
+    ages = {seed: valid_ages(folder / "checkpoints", tell, rows=rows) or {(0, 0)} for seed, folder in folders.items()}
     groups = []
     while ages:
         counts = Counter(age for own in ages.values() for age in own)

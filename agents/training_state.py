@@ -4,6 +4,7 @@ A checkpoint holds the state of every part (networks, targets, optimisers, world
 streams, the configuration and, through :mod:`agents.replay_files`, the replay buffer.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from agents.checkpoint import (
     CheckpointError,
     checkpoints,
     frames_of,
+    is_sound,
     keep_newest,
     load_checkpoint,
     save_checkpoint,
     set_aside,
 )
 from agents.replay import ReplayOfLearner
-from agents.replay_files import ReplayFiles
+from agents.replay_files import ReplayFiles, check_rows
 
 MAY_DIFFER = ("collector.total_frames", "train", "eval", "compile", "fixed_sizes", "cuda_graphs")
 """Settings that a run may change when it goes on from another run's checkpoint."""
@@ -108,23 +110,30 @@ class TrainingState:
         Raises:
             CheckpointError: if the checkpoint cannot be used; nothing has been restored then.
         """
-        found = None if resume == "never" else newest_valid(self.folder, tell, latest)
+        rows = self.replay is not None
+        found = None if resume == "never" else newest_valid(self.folder, tell, latest, rows=rows)
         if resume not in ("auto", "never"):
             path = Path(resume)
             elsewhere = (path if path.is_dir() else path.parent.parent).resolve() != self.folder.parent.resolve()
             if found is not None and elsewhere:
                 tell(f"{self.folder.parent} has checkpoints of its own: going on from them, not from {resume}.")
             else:
-                found = named_checkpoint(path, tell)
+                found = named_checkpoint(path, tell, rows=rows)
         if found is None:
-            set_aside(self.folder.parent)
+            if target := set_aside(self.folder.parent):
+                tell(
+                    f"starting anew ({'resume=never' if resume == 'never' else 'no checkpoint'}): what was there is in {target}."
+                )
             return True
         path, content = found
         own = path.parent.resolve() == self.folder.resolve()
         check_origin(path, content, self.origin, may_differ=() if own else MAY_DIFFER)
-        content["ended"] = content["ended"] and own  # a longer run goes on collecting
-        with_rows = self.replay is not None and content["replay"] is not None
-        if self.replay is not None and content["replay"] is not None and not content["ended"]:
+        without_rows = ""
+        if content["ended"] and not own:  # a longer run goes on collecting
+            content["ended"], without_rows = False, "a finished run's rows are deleted"
+        if self.replay is None or content["replay"] is None:
+            without_rows = "checkpoint.buffer=false"
+        elif not without_rows and not content["ended"]:
             self.replay.load(content["replay"], path.parent / "replay")
         _load_states(self.parts, content["parts"])
         torch.set_rng_state(content["torch"].cpu())
@@ -138,32 +147,63 @@ class TrainingState:
         for leftover in self.folder.glob("**/*.tmp"):  # of a write that was killed
             leftover.unlink()
         tell(f"going on from {path} at {content['frames']} frames.{_changes(content, self.origin)}")
-        if not with_rows:
-            tell("the replay buffer starts empty (checkpoint.buffer=false): not the bits of an uninterrupted run.")
-        return with_rows
+        if without_rows:
+            tell(f"the replay buffer starts empty ({without_rows}): not the bits of an uninterrupted run.")
+        return not without_rows
 
 
-def newest_valid(folder: Path, tell: Callable[[str], None], latest: int | None = None) -> tuple[Path, dict] | None:
+def newest_valid(
+    folder: Path, tell: Callable[[str], None], latest: int | None = None, *, rows: bool
+) -> tuple[Path, dict] | None:
     """The newest checkpoint of a ``checkpoints`` folder that a run can go on from, with its content; None if there is none.
 
     Args:
         folder: where to look.
         tell: shows a line for each one that is damaged.
         latest: of at most this many frames.
+        rows: its replay rows are needed too.
+
+    Raises:
+        CheckpointError: if only replay rows are missing, of all that there are.
     """
+    without_rows: CheckpointError | None = None
+    sound = functools.cache(is_sound)
     for path in reversed(checkpoints(folder)):
         if latest is not None and frames_of(path) > latest:
             continue
         try:
-            return path, load_resumable(path)
+            content = load_resumable(path)
         except CheckpointError as error:
             tell(f"passed over: {error}")
+            continue
+        try:
+            if rows:
+                check_rows_of(path, content, sound)
+            return path, content
+        except CheckpointError as error:
+            without_rows = without_rows or error
+            tell(f"passed over {path.name}: {error}")
+    if without_rows is not None:
+        raise without_rows
     return None
 
 
-def valid_ages(folder: Path, tell: Callable[[str], None]) -> set[tuple[int, int]]:
-    """Frames and updates of the checkpoints of a ``checkpoints`` folder that a run can go on from."""
-    ages = set()
+def check_rows_of(path: Path, content: dict, sound: Callable[[Path], bool] = is_sound) -> None:
+    """Refuse a checkpoint that lacks its replay rows; one of a run that collects no more needs none.
+
+    Raises:
+        CheckpointError: naming the rows.
+    """
+    if content["replay"] is not None and not content["ended"]:
+        check_rows(content["replay"], path.parent / "replay", sound)
+
+
+def valid_ages(folder: Path, tell: Callable[[str], None], *, rows: bool) -> set[tuple[int, int]]:
+    """Frames and updates of the checkpoints of a ``checkpoints`` folder that a run can go on from.
+
+    Those whose replay ``rows`` are not there are left out, if they are needed and others have theirs.
+    """
+    ages, complete, sound = set(), set(), functools.cache(is_sound)
     for path in checkpoints(folder):
         try:
             content = load_resumable(path)
@@ -171,19 +211,34 @@ def valid_ages(folder: Path, tell: Callable[[str], None]) -> set[tuple[int, int]
             tell(f"passed over: {error}")
             continue
         moments = content["parts"]["optimizers"]["loss_value"]["state"]
-        ages.add((content["frames"], int(next(iter(moments.values()))["step"]) if moments else 0))
-    return ages
+        age = (content["frames"], int(next(iter(moments.values()))["step"]) if moments else 0)
+        ages.add(age)
+        try:
+            if rows:
+                check_rows_of(path, content, sound)
+            complete.add(age)
+        except CheckpointError as error:
+            tell(f"passed over {path.name}: {error}")
+    return complete or ages
 
 
-def named_checkpoint(path: Path, tell: Callable[[str], None]) -> tuple[Path, dict]:
+def named_checkpoint(path: Path, tell: Callable[[str], None], *, rows: bool) -> tuple[Path, dict]:
     """The checkpoint that ``resume=<path>`` names: a file, or the newest valid one of a run's folder.
 
+    Args:
+        path: file or folder.
+        tell: shows a line for each one that is damaged.
+        rows: its replay rows are needed too.
+
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is none, or it lacks its rows.
     """
     if not path.is_dir():
-        return path, load_resumable(path)
-    found = newest_valid(path / "checkpoints", tell)
+        content = load_resumable(path)
+        if rows:
+            check_rows_of(path, content)
+        return path, content
+    found = newest_valid(path / "checkpoints", tell, rows=rows)
     if found is None:
         raise CheckpointError(
             f"resume={path}: {path / 'checkpoints'} holds no checkpoint that a run can go on from. Give a checkpoint file or "
@@ -230,9 +285,27 @@ def check_origin(path: Path, content: dict, origin: dict, may_differ: tuple[str,
         )
 
 
+def check_frames(resume: str, frames: int, total: int) -> None:
+    """Refuse a checkpoint of more ``frames`` than a run is asked for.
+
+    Raises:
+        CheckpointError: naming both.
+    """
+    if frames > total:
+        raise CheckpointError(
+            f"resume={resume}: its checkpoint is at {frames} frames, beyond collector.total_frames={total}: ask for more, or "
+            "take an older one."
+        )
+
+
 def _changes(content: dict, origin: dict) -> str:
     names = [name for name in ("git_hash", "versions", "device", "threads") if content[name] != origin[name]]
-    return f" Changed since: {', '.join(names)}; the bits may differ from an uninterrupted run's." if names else ""
+    if not names:
+        return ""
+    code = ""
+    if "git_hash" in names:
+        code = f" (the code: until here it was {content['git_hash']}, from here it is {origin['git_hash']})"
+    return f" Changed since: {', '.join(names)}{code}; the bits may differ from an uninterrupted run's."
 
 
 def _flat(config: dict, prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from agents.training_config import seeds_of
 from conf.naming import config_hash, program_name, run_name
+from conf.versions import git_hash
 from envs import SurveillanceConfig
 from envs.inequalities import derived_quantities
 
@@ -82,12 +83,16 @@ def _write_hydra_files(cfg: DictConfig, seed: int, folder: Path, output: Path) -
     OmegaConf.save(hydra.hydra.overrides.task, target / "overrides.yaml")
 
 
-def finished_evaluation(path: Path, asked: dict) -> bool:
-    """Whether ``path`` is the complete ``eval.json`` of an evaluation of the same length, worlds, seed and policy."""
+def finished_evaluation(path: Path, asked: dict) -> str | None:
+    """What to tell the user if ``path`` is the complete ``eval.json`` of an evaluation of the same length, worlds, seed and
+    policy; None otherwise.
+    """
     if not path.is_file():
-        return False
+        return None
     content = json.loads(path.read_text())
-    return all(content.get(name) == value for name, value in asked.items())
+    if any(content.get(name) != value for name, value in asked.items()):
+        return None
+    return f"{path} exists: nothing to do. {_other_code(path, 'was made')}resume=never evaluates anew."
 
 
 def finished_program(cfg: DictConfig) -> str | None:
@@ -110,7 +115,14 @@ def finished_run(folder: Path, resume: str | None) -> str | None:
         return None
     if folder.resolve() in (Path(resume).resolve(), *Path(resume).resolve().parents):  # one of its own checkpoints
         return None
-    return f"{folder} holds a finished run: nothing to do. resume=never trains it anew."
+    code = _other_code(folder / "summary.json", "was trained")
+    return f"{folder} holds a finished run: nothing to do. {code}resume=never trains it anew."
+
+
+def _other_code(path: Path, what: str) -> str:
+    """A sentence if the results in a JSON file are of another commit than this one's; an empty string otherwise."""
+    there, here = json.loads(path.read_text()).get("git_hash"), git_hash()
+    return f"It {what} by the code of {there}, this is {here}. " if there not in (None, here) else ""
 
 
 def foreign_run(folder: Path, cfg: DictConfig, seed: int) -> str | None:

@@ -12,7 +12,7 @@ from agents import make_controller
 from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
 from agents.ray_cluster import reach_ray
 from agents.training_config import Config, WorkersConfig
-from agents.training_state import MAY_DIFFER, check_origin, named_checkpoint
+from agents.training_state import MAY_DIFFER, check_frames, check_origin, named_checkpoint
 from conf.evaluate_schema import EvaluateConfig
 from conf.launching import register_resolvers
 from conf.manual import check_names, groups, manual
@@ -81,10 +81,11 @@ def check_training(cfg: DictConfig) -> None:
     if config.workers.count and config.workers.ray_address is not None:
         reach_ray(config.workers.ray_address, "workers.ray_address")
     if config.resume not in ("auto", "never"):
-        path, content = named_checkpoint(Path(config.resume), tell=lambda line: None)
+        path, content = named_checkpoint(Path(config.resume), lambda line: None, rows=config.checkpoint.buffer)
         own = path.parent.parent.resolve() == Path(str(cfg.hydra.run.dir)).resolve()
         here = {"config": hashed_config(cfg), "seed": config.seed}
         check_origin(path, content, here, may_differ=() if own else MAY_DIFFER)
+        check_frames(config.resume, content["frames"], config.collector.total_frames)
 
 
 def check_evaluation(cfg: DictConfig) -> None:

@@ -1,6 +1,7 @@
 """The world's parameters: one dataclass with a default, a unit and a range for every field, validated when it is built."""
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -255,6 +256,8 @@ class SurveillanceConfig:
         check_choice("env.dtype", self.dtype, ("float32", "float64"))
 
     def _check_layout(self) -> None:
+        for name in ("arena", "stations", "slots", "density_centers"):
+            setattr(self, name, _listed(getattr(self, name)))
         if not _is_table(self.arena, (2,)) or len(self.arena) not in (2, 3):
             raise ValueError(f"env.arena={self.arena} must be 2 or 3 rows [low, high] in metres.")
         if any(not low < high for low, high in self.bounds):
@@ -270,10 +273,26 @@ class SurveillanceConfig:
                 )
         if not self.density_centers:
             raise ValueError("env.density_centers=[] is empty: give at least one centre.")
+        if self.density == "moving" or (self.density == "gaussian_mixture" and not self.density_per_world):
+            centers = zip(self.density_centers, self.density_center_positions, strict=True)
+            if outside := [row for row, center in centers if not self._inside(center)]:
+                warnings.warn(
+                    f"env.density_centers={self.density_centers}: {outside} lie outside env.arena={self.arena}, so what is worth "
+                    "watching is at its edge. Give centres inside the arena, or density=uniform.",
+                    stacklevel=2,
+                )
+
+    def _inside(self, position: list[float]) -> bool:
+        return all(low <= x <= high for x, (low, high) in zip(position, self.bounds, strict=True))
 
     def _complete(self, rows: list[list[float]], *, floor: bool) -> list[list[float]]:
         fill = [low if floor else (low + high) / 2 for low, high in self.bounds]
         return [[float(x) for x in row] + fill[len(row) :] for row in rows]
+
+
+def _listed(rows: Any) -> Any:
+    """Rows given as tuples, as lists."""
+    return [_listed(row) for row in rows] if isinstance(rows, list | tuple) else rows
 
 
 def _is_table(rows: Any, widths: tuple[int, ...]) -> bool:

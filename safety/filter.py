@@ -77,6 +77,7 @@ class SafetyFilter(TensorDictModuleBase):
     Raises:
         ValueError: if a gain does not fit the world's time step or certificate, or ``fixed_sizes`` the solver or the graphs.
         KeyError: from ``forward``, if an input key is missing.
+        ValueError: from ``forward``, if an input's shape or type is not the world's.
     """
 
     def __init__(
@@ -119,11 +120,26 @@ class SafetyFilter(TensorDictModuleBase):
                 f"SafetyFilter needs {missing}, the tensordict has {sorted(map(str, tensordict.keys(True, True)))}."
             )
         nominal, position, energy, slot = inputs
+        self._check_shapes(inputs)
         self._layout(position)  # made before anything is traced
         outputs = self._filter(nominal, position, energy.squeeze(-1), slot.squeeze(-1))
         for key, value in zip(self.out_keys, outputs, strict=True):
             tensordict.set(key, value)
         return tensordict
+
+    def _check_shapes(self, inputs: list[Tensor]) -> None:
+        n, d = self.world.n_agents, self.world.dimension
+        batch = inputs[1].shape[:-2]
+        for key, value, width in zip(self.in_keys, inputs, (d, d, 1, 1), strict=True):
+            if value.shape != (*batch, n, width):
+                raise ValueError(
+                    f"{key} has shape {tuple(value.shape)}: this filter's world (n_agents={n}, dimension={d}) needs "
+                    f"(*B, {n}, {width}), *B as {keys.POSITION}'s, {tuple(batch)}."
+                )
+        if not inputs[1].is_floating_point() or inputs[3].dtype != torch.int64:
+            raise ValueError(
+                f"{keys.POSITION} is {inputs[1].dtype} and {keys.SLOT} {inputs[3].dtype}: floating point and int64 needed."
+            )
 
     def filter(self, nominal: Tensor, position: Tensor, energy: Tensor, slot: Tensor) -> tuple[Tensor, ...]:
         """The filter on plain tensors, in the order of ``out_keys``.

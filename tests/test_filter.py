@@ -208,7 +208,7 @@ def test_every_variant_is_finite_bounded_and_never_executes_an_unsolved_problem(
     torch.testing.assert_close(out["correction"].squeeze(-1), (out["action"] - cut).norm(dim=-1), rtol=1e-4, atol=1e-6)
 
 
-def test_missing_input_is_named():
+def test_inputs_that_are_missing_or_of_another_world_are_named():
     world = make_world()
     nominal, position, energy, slot = calm_inputs(world)
     full = {
@@ -221,6 +221,16 @@ def test_missing_input_is_named():
         td = TensorDict({key: value for key, value in full.items() if key != absent}, [4])
         with pytest.raises(KeyError, match=absent[-1]):
             SafetyFilter(SafetyConfig(mode="paper"), world)(td)
+    for key, bad in (
+        (keys.NOMINAL_ACTION, nominal[..., :1]),
+        (keys.POSITION, position[:, :2]),
+        (keys.ENERGY, energy),
+        (keys.SLOT, slot[:, :2, None]),
+        (keys.SLOT, slot[..., None].float()),
+        (keys.POSITION, position.long()),
+    ):
+        with pytest.raises(ValueError, match=key[-1]):
+            SafetyFilter(SafetyConfig(), world)(TensorDict(full, [4]).set(key, bad))
     td = SafetyFilter(SafetyConfig(mode="paper"), world)(TensorDict(full, [4]))
     assert td[keys.ACTION].shape == (4, 3, 2)
     for key in (

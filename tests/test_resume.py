@@ -22,11 +22,17 @@ pytestmark = pytest.mark.xdist_group("resume")  # its fixtures are made once, no
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Result of a run that nothing happens to."""
+def finished(tmp_path_factory):
+    """Folder of a run that nothing happens to; to be read, not used."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     assert run(folder) == 0, said(folder)
-    found = result(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(finished):
+    """Result of a run that nothing happens to."""
+    found = result(finished)
     assert {"eval/coverage_cost", "train/energy", "world/animation"} <= set(found["curves"])
     return found
 
@@ -160,22 +166,29 @@ def test_a_damaged_checkpoint_that_is_asked_for_is_refused(program, tmp_path, ki
     assert "a policy only" in " ".join(output.split())
 
 
-def test_missing_or_damaged_rows_are_refused(program, tmp_path, killed):
+@pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
+def test_a_checkpoint_without_its_rows_is_passed_over(tmp_path, whole, killed, damage):
     folder = copy(killed, tmp_path / "run")
-    rows = sorted((folder / "checkpoints" / "replay").iterdir())
-    flip(rows[-1])
-    code, output = program(train.main, *RUN, f"hydra.run.dir={folder}")
-    assert code == 1
-    assert rows[-1].name in "".join(output.split())  # a long path is wrapped
-    assert "cannot be read" in " ".join(output.split())
-    rows[-1].unlink()
-    code, output = program(train.main, *RUN, f"hydra.run.dir={folder}")
-    assert code == 1
-    assert "lacks the replay rows" in " ".join(output.split())
-    assert "checkpoint.buffer=false" in " ".join(output.split())
+    damage(sorted((folder / "checkpoints" / "replay").iterdir())[-1])
+    assert run(folder) == 0, said(folder)
+    assert "passed over frames_000000000480.pt" in said(folder)
+    assert "frames_000000000384.pt at 384 frames" in said(folder)
+    assert not differences(whole, result(folder))
+
+
+@pytest.mark.parametrize("damage", [flip, cut, Path.unlink])
+def test_rows_that_all_checkpoints_need_are_asked_for(program, tmp_path, killed, damage):
+    folder = copy(killed, tmp_path / "run")
+    damage(sorted((folder / "checkpoints" / "replay").iterdir())[0])
+    for arguments in ((f"hydra.run.dir={folder}",), (f"resume={folder}", "hydra.run.dir=other")):
+        code, output = program(train.main, *RUN, *arguments)
+        assert code == 1
+        assert "lacks the replay rows 0 to" in " ".join(output.split())
+        assert "checkpoint.buffer=false" in " ".join(output.split())
+    assert not (tmp_path / "other").exists()
     code, output = program(train.main, *RUN, f"hydra.run.dir={folder}", "checkpoint.buffer=false")
     assert code == 0, output
-    assert "the replay buffer starts empty" in " ".join(output.split())
+    assert "the replay buffer starts empty (checkpoint.buffer=false)" in " ".join(output.split())
     assert json.loads((folder / "summary.json").read_text())["checkpoint"] == {"buffer": False}
 
 
@@ -208,6 +221,30 @@ def test_a_run_is_made_longer_from_another_runs_checkpoint(program, tmp_path, ki
         for name in ("longer", "whole")
     ]
     assert not differences(*networks)
+
+
+def test_a_finished_run_is_made_longer_with_an_empty_buffer(program, tmp_path, finished):
+    arguments = (*RUN, "collector.total_frames=1536", "hydra.run.dir=longer", f"resume={finished}")
+    code, output = program(train.main, *arguments)
+    assert code == 0, output
+    assert "the replay buffer starts empty (a finished run's rows are deleted)" in " ".join(output.split())
+    assert json.loads((tmp_path / "longer" / "summary.json").read_text())["frames"] == 1536
+    code, output = program(train.main, *RUN, "collector.total_frames=512", "hydra.run.dir=shorter", arguments[-1])
+    assert code == 1
+    assert "its checkpoint is at 1024 frames, beyond collector.total_frames=512" in " ".join(output.split())
+    assert not (tmp_path / "shorter").exists()
+
+
+def test_a_run_that_starts_anew_says_where_the_attempt_before_it_is(program, tmp_path):
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    short = (*RUN, "collector.total_frames=128", "train.warmup_frames=64", "hydra.run.dir=run")
+    code, output = program(train.main, *short)
+    assert code == 0, output
+    assert "starting anew (no checkpoint): what was there is in" in " ".join(output.split())
+    assert "run/replaced_1." in "".join(output.split())
+    code, output = program(train.main, *short, "resume=never")
+    assert "starting anew (resume=never)" in " ".join(output.split())
+    assert "run/replaced_2." in "".join(output.split())
 
 
 def test_rewinding_keeps_what_came_later(program, tmp_path, killed):

@@ -220,10 +220,10 @@ def test_groups_of_seeds(tmp_path):
             moments = {0: {"step": torch.tensor(float(count + updates))}}
             parts = {"optimizers": {"loss_value": {"state": moments}}}
             path = tmp_path / str(seed) / "checkpoints" / f"frames_{count:012d}.pt"
-            save_checkpoint(path, {"frames": count, "parts": parts})
+            save_checkpoint(path, {"frames": count, "parts": parts, "replay": None, "ended": False})
 
     def groups(*seeds):
-        found = equally_far({seed: tmp_path / str(seed) for seed in seeds}, "auto", [].append)
+        found = equally_far({seed: tmp_path / str(seed) for seed in seeds}, "auto", [].append, rows=True)
         return [(start, sorted(group)) for start, group in found]
 
     save(0, 100, 200)
@@ -236,7 +236,7 @@ def test_groups_of_seeds(tmp_path):
     assert groups(4, 5, 0) == [(0, [4, 5]), (200, [0])]
     (tmp_path / "1" / "checkpoints" / "frames_000000000100.pt").write_bytes(b"damaged")
     assert groups(0, 1) == [(200, [0]), (0, [1])]
-    assert equally_far({0: tmp_path, 1: tmp_path}, "never", [].append) == [(0, {0: tmp_path, 1: tmp_path})]
+    assert equally_far({0: tmp_path, 1: tmp_path}, "never", [].append, rows=True) == [(0, {0: tmp_path, 1: tmp_path})]
 
 
 def test_blocks_of_worlds_are_worlds_of_their_own():

@@ -3,6 +3,7 @@ import math
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -185,6 +186,43 @@ def test_another_evaluation_in_the_same_folder_is_not_taken_for_this_one(program
         assert code == 0, output
         assert "nothing to do" not in output
     assert "nothing to do" in program(evaluate.main, *common, "num_envs=3")[1]
+
+
+def test_a_policy_that_has_been_trained_further_is_evaluated_again(program, tmp_path):
+    assert program(train.main, *TINY)[0] == 0
+    (run,) = tmp_path.glob("runs/default/*_seed0")
+    common = (f"run={run}", "steps=4", "num_envs=2", "pictures=false", "resume=auto", "checkpoint=best.pt")
+    assert program(evaluate.main, *common)[0] == 0
+    (path,) = run.glob("eval/*/eval.json")
+    first, best = json.loads(path.read_text()), run / "checkpoints" / "best.pt"
+    assert "nothing to do" in program(evaluate.main, *common)[1]
+    path.write_text(json.dumps(first | {"git_hash": "0123abc"}))
+    assert "It was made by the code of 0123abc, this is " in " ".join(program(evaluate.main, *common)[1].split())
+    torch.save(torch.load(best, weights_only=True) | {"frames": first["policy_frames"] + 1}, best)
+    code, output = program(evaluate.main, *common)
+    assert code == 0, output
+    assert "nothing to do" not in output
+    assert json.loads(path.read_text())["policy_frames"] == first["policy_frames"] + 1
+
+
+def test_a_finished_run_of_other_code_is_left_alone_and_says_so(program, tmp_path):
+    assert program(train.main, *TINY, "hydra.run.dir=run")[0] == 0
+    path = tmp_path / "run" / "summary.json"
+    assert "the code of" not in program(train.main, *TINY, "hydra.run.dir=run")[1]
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"git_hash": "0123abc"}))
+    output = " ".join(program(train.main, *TINY, "hydra.run.dir=run")[1].split())
+    assert "holds a finished run: nothing to do. It was trained by the code of 0123abc, this is " in output
+
+
+def test_a_run_that_learns_nothing_says_so(program, tmp_path):
+    updates = {}
+    for warmup in (0, 32, 64, 65):
+        code, output = program(train.main, *TINY, f"train.warmup_frames={warmup}", f"hydra.run.dir={warmup}")
+        assert code == 0, output
+        said = "nothing is learnt: train.warmup_frames=65 is more than collector.total_frames=64." in output
+        assert said == (warmup == 65)
+        updates[warmup] = json.loads((tmp_path / str(warmup) / "summary.json").read_text())["updates"]
+    assert updates == {0: 6, 32: 5, 64: 1, 65: 0}  # 8 iterations; the first transition of 5 steps comes in the third
 
 
 def test_overrides_of_an_evaluation_are_checked_in_the_runs_world(program, tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 
 import pytest
 
@@ -138,6 +139,26 @@ def test_tables_of_positions_are_checked(name, rows):
     message = refused(**{name: rows, "n_agents": 1})
     assert f"env.{name}={rows}" in message
     assert "list of positions" in message
+
+
+def test_tables_may_be_tuples():
+    arena, stations = [[0.0, 3.0], [0.0, 2.0]], [[0.2, 0.2], [2.8, 0.2], [0.2, 1.8]]
+    rows = SurveillanceConfig(arena=arena, stations=stations, density="uniform")
+    tuples = {"arena": tuple(map(tuple, arena)), "stations": tuple(map(tuple, stations))}
+    assert SurveillanceConfig(**tuples, density="uniform") == rows  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("density", ["gaussian_mixture", "moving"])
+def test_what_is_worth_watching_beyond_the_arena_is_said(density):
+    with pytest.warns(UserWarning, match=r"\[\[-0.45, -0.35\], \[0.5, -0.15\]\] lie outside env.arena"):
+        SurveillanceConfig(arena=[[0, 3], [0, 2]], stations=[[0, 0], [3, 0], [0, 2]], density=density)
+
+
+@pytest.mark.parametrize("changes", [{"density": "uniform"}, {"density": "age"}, {"density_per_world": True}])
+def test_centres_that_nobody_reads_may_be_anywhere(changes):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        SurveillanceConfig(arena=[[0, 3], [0, 2]], stations=[[0, 0], [3, 0], [0, 2]], **changes)
 
 
 def test_a_density_needs_a_centre():
