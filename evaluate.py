@@ -1,8 +1,8 @@
 """Roll a trained policy or a controller out behind a filter, measure it and draw it.
 
-``python evaluate.py run=<folder>`` writes ``<folder>/eval/<world>_<steps>_<seed>/``; ``python evaluate.py
-controller=<name> env=… safety=…`` writes a folder under ``runs/controllers/``. Both hold eval.json, the pictures of the
-paper's Figs 5-7, the paths, the battery plot and a video (GIF, MP4) of the first world.
+``python evaluate.py run=<folder>`` writes ``<folder>/eval/<world>_<steps>_<seed>/``, with a hash of overrides in the name where
+there are some; ``python evaluate.py controller=<name> env=… safety=…`` writes a folder under ``runs/controllers/``. Both hold
+eval.json, the pictures of the paper's Figs 5-7, the paths, the battery plot and a video (GIF, MP4) of the first world.
 """
 
 import functools

@@ -33,7 +33,7 @@ class AgentConfig:
     """Critics also see the batteries and the coverage cost that this many steps of the actions would lead to, by the
     world's model, 0..1000 (0: the paper)."""
     gamma: float = 0.99
-    """Discount per step, [0, 1)."""
+    """Discount per step, [0, 0.999999]."""
     n_steps: int = 5
     """Steps of reward in the critics' target before it bootstraps, 1..1000 (1: the paper)."""
     initial_reward: float = -0.65

@@ -205,8 +205,10 @@ class Config:
     resume: str = "auto"
     """auto: a finished run is left alone, an unfinished one goes on from its newest valid checkpoint. never: start anew in
     the same folder; what an earlier run left there is moved to replaced_<k>. A path: go on from that checkpoint, or the newest
-    of that run's folder; only collector.total_frames, train, eval, compile, fixed_sizes and cuda_graphs may differ
-    from its settings."""
+    of that run's folder. The seed must be the same, and of the settings in the configuration's hash only
+    collector.total_frames, train, eval, compile, fixed_sizes and cuda_graphs may differ from its own (device, threads, log,
+    checkpoint and the like are not in it). A finished run has deleted its replay rows: from its checkpoint a run goes on with
+    an empty replay buffer."""
     deterministic: bool = False
     """Refuse operations of PyTorch that may differ between runs of the same seed (CUDA has some; slower there)."""
     compile: bool = False

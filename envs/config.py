@@ -69,7 +69,7 @@ class SurveillanceConfig:
     charge_radius_full: float = 0.12
     """Distance to a station up to which the charging field is 1, m, [0, charge_radius)."""
     charge_radius: float = 0.24
-    """Distance to a station at which the charging field reaches 0, m."""
+    """Distance to a station at which the charging field reaches 0, m, (0, 100]."""
     safety_distance: float = 0.12
     """Minimum distance Delta of two robots, m, (0, 10]."""
     horizon: int = 100
@@ -98,7 +98,7 @@ class SurveillanceConfig:
     reserve: str = "linear"
     """Reserve family rho: linear (drive home at homing_speed) | logarithmic (exponential approach; needs more reserve)."""
     homing_speed: float = 0.98
-    """Speed v of driving home as a share of max_speed, (0, 1)."""
+    """Speed v of driving home as a share of max_speed, (0, 0.9999]."""
     homing_clearance: float = 0.0
     """Distance Delta_G that two robots on their way home must keep, m, [0, 10]; 0 = the least that will do."""
     reassign_slots: bool = True
@@ -106,7 +106,7 @@ class SurveillanceConfig:
     reset_clearance: float = 0.0
     """Distance added to the certificate's Delta_G when a start state is drawn, m, [0, 10]."""
     reset_reserve: float = 0.1
-    """Share of the battery's range that a drawn robot has above its reserve, [0, 1)."""
+    """Share of the battery's range that a drawn robot has above its reserve, [0, 0.99]."""
     observe_centroid: bool = False
     """Append the vector to the robot's Voronoi centroid to its observation (hands Lloyd's answer to the network: for ablation)."""
     dtype: str = "float32"

@@ -1,4 +1,8 @@
-"""TensorDict keys shared by the environment, the filter, the learner and the controllers (one place, no strings elsewhere)."""
+"""TensorDict keys shared by the environment, the filter, the learner and the controllers: one place, no strings elsewhere.
+
+Not here: TorchRL's own names ("next", "done", "terminated", "truncated", "_reset"), the names by which a world keeps its state
+(:data:`envs.surveillance.STATE`), and keys of the learner alone, constants of :mod:`agents.networks` and :mod:`agents.pipeline`.
+"""
 
 AGENTS = "agents"
 OBSERVATION = (AGENTS, "observation")

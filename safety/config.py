@@ -47,7 +47,7 @@ class SafetyConfig:
     alpha_o: float | None = None
     """Class-K gain of the overcharge barrier, 1/s, (0, 1/dt]; null = 0.5/dt."""
     alpha_s: float | None = None
-    """Class-K gain of the collision barrier, 1/s, (0, 1/dt]; null = 1/dt (0.5/dt with split=full)."""
+    """Class-K gain of the collision barrier, 1/s, (0, 1/dt], with split=full (0, 0.5/dt]; null = the largest."""
     alpha_g: float | None = None
     """Class-K gain of the homing certificate far from its limit, 1/s, (0, 1/dt]; null = 1/dt. certified only."""
     solver: str = "auto"
@@ -110,8 +110,8 @@ class SafetyConfig:
         """The gains in this world, 1/s.
 
         Raises:
-            ValueError: if a gain is outside ``(0, 1/dt]``, where a sampled barrier may jump below zero, or does not fit
-                the world's certificate (docs/safety.md, inequalities 1, 4 and 6).
+            ValueError: if a gain is outside ``(0, 1/dt]`` (``alpha_s`` with ``split=full``: ``(0, 0.5/dt]``), where a sampled
+                barrier may jump below zero, or does not fit the world's certificate (docs/safety.md, inequalities 1, 4 and 6).
         """
         defaults = {"alpha_c": 0.2, "alpha_o": 0.5, "alpha_s": 0.5 if self.split == "full" else 1.0, "alpha_g": 1.0}
         values = []
