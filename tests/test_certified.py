@@ -150,9 +150,14 @@ def test_level_and_status_say_who_decided(index):
     moved = (action - limit_speed(d["nominal_action"], world.max_speed)).norm(dim=-1)
     moved[broken] = world.max_speed
     torch.testing.assert_close(d["correction"], moved, rtol=1e-4, atol=1e-6 * world.max_speed)
+    geometry = record.env.geometry
+    way = (d["position"] - record.env.slots[d["slot"]]).norm(dim=-1)
+    spare, fine = d["energy"] - world.energy_min - reserve(way, geometry), 0.2 * geometry.eps_energy
+    torch.testing.assert_close(d["h_c"], spare, rtol=1e-5, atol=fine)
+    torch.testing.assert_close(d["h_o"], world.energy_max - d["energy"], rtol=0, atol=fine)
     if world.n_agents > 1:
-        gap = closest_approach(d["position"], record.env.slots[d["slot"]], record.env.geometry)
-        least = gap.amin(-1) - record.env.geometry.clearance
+        gap = closest_approach(d["position"], record.env.slots[d["slot"]], geometry)
+        least = gap.amin(-1) - geometry.clearance
         torch.testing.assert_close(d["h_g"].amin(-1), least, rtol=0, atol=1e-6 * world.diameter)
 
 

@@ -18,6 +18,7 @@ WORLDS = pytest.mark.parametrize(
     [
         {},
         {"n_agents": 1},
+        {"n_agents": 2},
         {"n_agents": 5, "density": "uniform"},
         {"density_per_world": True, "arena": [[0.5, 2.5], [1, 3]]},
         {"density": "moving"},

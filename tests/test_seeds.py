@@ -3,13 +3,14 @@
 import json
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from agents.checkpoint import checkpoints, load_checkpoint, save_checkpoint
+from agents.checkpoint import CheckpointError, checkpoints, load_checkpoint, save_checkpoint
 from agents.config import AgentConfig
 from agents.incident import ViolationError
 from agents.learners import LearnerStack, make_learner, make_learners
@@ -18,7 +19,7 @@ from agents.networks import make_policies
 from agents.pipeline import InferenceCollector
 from agents.report_runs import find_runs
 from agents.run import TrainingRun
-from agents.seeds import equally_far
+from agents.seeds import SeedsFailedError, equally_far, for_each
 from conf.naming import config_hash
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.coverage import weighted_sum
@@ -212,6 +213,26 @@ def test_a_signal_writes_the_checkpoints_of_all_seeds(tmp_path, alone):
     assert f"stopped by SIGTERM at {frames} frames, checkpoint written in the folders of 2 seeds" in said(folder)
     assert run(folder, arguments) == 0, said(folder)
     assert not differences([own["curves"] for own in alone], [compared(folder / f"seed{k}")["curves"] for k in (0, 1)])
+
+
+def test_a_program_ends_as_soon_as_all_its_seeds_have_failed():
+    closed, acted = [], []
+    board = SimpleNamespace(close=lambda: closed.append(1))
+    runs = [SimpleNamespace(seed=seed, error=None, board=board) for seed in (4, 7)]
+
+    def act(run, limit):
+        acted.append(run.seed)
+        if run.seed < limit:
+            raise CheckpointError(f"{run.seed} is broken")
+
+    for_each(runs, act, [5, 5])
+    assert (str(runs[0].error), runs[1].error, len(closed)) == ("4 is broken", None, 1)
+    for_each(runs, act, [5, 5])
+    assert acted == [4, 7, 7]
+    with pytest.raises(SeedsFailedError, match=r"^2 of 2 seeds failed: 4, 7\.\nseed 4: 4 is broken$"):
+        for_each(runs, act, [9, 9])
+    with pytest.raises(CheckpointError, match="7 is broken"):  # alone it is the program's error
+        for_each([SimpleNamespace(seed=7, error=None, board=board)], act, [9])
 
 
 def test_groups_of_seeds(tmp_path):
