@@ -145,7 +145,7 @@ def log(runs: Sequence[TrainingRun], following: TensorDictBase, losses: Mapping[
 def stopped_at(runs: Sequence[TrainingRun]) -> str:
     """How far a program is that was asked to stop, and where its checkpoints are, for the message."""
     good = [run for run in runs if run.error is None]
-    where = good[0].folder if len(runs) == 1 else f"the folders of {len(good)} seeds"
+    where = good[0].folder if len(good) == 1 else f"the folders of {len(good)} seeds"
     lost = "".join(f"; seed {run.seed} had failed: {run.error}" for run in runs if run.error is not None)
     return f"at {good[0].recorder.frames} frames, checkpoint written in {where}{lost}"
 

@@ -19,7 +19,7 @@ from agents.networks import make_policies
 from agents.pipeline import InferenceCollector
 from agents.report_runs import find_runs
 from agents.run import TrainingRun
-from agents.seeds import SeedsFailedError, equally_far, for_each
+from agents.seeds import SeedsFailedError, equally_far, for_each, stopped_at
 from conf.naming import config_hash
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.coverage import weighted_sum
@@ -233,6 +233,16 @@ def test_a_program_ends_as_soon_as_all_its_seeds_have_failed():
         for_each(runs, act, [9, 9])
     with pytest.raises(CheckpointError, match="7 is broken"):  # alone it is the program's error
         for_each([SimpleNamespace(seed=7, error=None, board=board)], act, [9])
+
+
+def test_a_stopped_program_says_where_its_checkpoints_are_and_what_had_failed():
+    good = [
+        SimpleNamespace(seed=k, error=None, folder=f"runs/{k}", recorder=SimpleNamespace(frames=96)) for k in (3, 5)
+    ]
+    bad = SimpleNamespace(seed=4, error=CheckpointError("broken"))
+    assert stopped_at(good[:1]) == "at 96 frames, checkpoint written in runs/3"
+    assert stopped_at(good) == "at 96 frames, checkpoint written in the folders of 2 seeds"
+    assert stopped_at([bad, *good[1:]]) == "at 96 frames, checkpoint written in runs/5; seed 4 had failed: broken"
 
 
 def test_groups_of_seeds(tmp_path):
