@@ -8,24 +8,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from agents.evaluation import rollout_steps
+from agents.report_runs import NOT_HASHED
 from agents.training_config import seeds_of
-
-# Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = (
-    "seed",
-    "seeds",
-    "n_seeds",
-    "device",
-    "threads",
-    "deterministic",
-    "resume",
-    "debug",
-    "checkpoint",
-    "log",
-    "hydra",
-    "folder",
-    *("video", "format", "samples"),  # of evaluate.py's pictures
-)
 
 COMPUTED = ("fixed_sizes", "cuda_graphs")
 """How a run computes, where not as by default."""
@@ -33,12 +17,12 @@ GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
 
 def config_hash(cfg: DictConfig) -> str:
-    """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
+    """First 8 hex digits of a digest of the resolved configuration without :data:`agents.report_runs.NOT_HASHED`."""
     return hashlib.sha256(json.dumps(hashed_config(cfg), sort_keys=True).encode()).hexdigest()[:8]
 
 
 def hashed_config(cfg: DictConfig) -> dict:
-    """The resolved configuration without :data:`NOT_HASHED`, nested; workers, fixed sizes and graphs only where there are some."""
+    """The resolved configuration without ``NOT_HASHED``, nested; workers, fixed sizes and graphs only where there are some."""
     found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
     workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
     kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
