@@ -30,7 +30,17 @@ from agents.training_config import seeds_of
 from conf.job_log import LOG, FailedRunError, read_failure
 from conf.launching import SweepError, check_launcher, is_broken_pool, patient, replaced
 from conf.run_folder import finished_run, foreign_run, objective, run_folders
-from conf.sweep_jobs import FAILED_JOBS, FailedJob, Job, is_listed, list_jobs, refuse_shared_folders
+from conf.sweep_jobs import (
+    FAILED_JOBS,
+    FailedJob,
+    Job,
+    conclusion,
+    ending,
+    is_listed,
+    list_jobs,
+    own_names,
+    refuse_shared_folders,
+)
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 
@@ -52,6 +62,7 @@ class SweepLauncher(Launcher):
         self.basic = isinstance(inner, BasicLauncher)
         self.remote = "Slurm" in type(inner).__name__ or "Ray" in type(inner).__name__  # other machines, other devices
         self.stopped: int | None = None
+        self.launched: list[Job] = []
         subdir = OmegaConf.to_container(config.hydra.sweep, resolve=False)["subdir"]  # pyright: ignore
         self.numbered = "hydra.job" in str(subdir)  # folders by number: no run may be left out of the list
         self._planned: dict[tuple[str, ...], Job] = {}
@@ -76,6 +87,7 @@ class SweepLauncher(Launcher):
         jobs = []
         for number, overrides in enumerate(job_overrides, initial_job_idx):
             jobs.append(self._planned.get(tuple(overrides)) or self._plan(overrides, number))
+        self.launched += jobs
         todo, first = [], {}
         for job in jobs:
             if job.error is None and first.setdefault(job.folder, job) is not job:
@@ -99,7 +111,8 @@ class SweepLauncher(Launcher):
         config = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
         with open_dict(config):
             config.hydra.job.num, config.hydra.job.id = number, str(number)
-        job = Job(list(overrides), Path())
+        read = "collector" in config or config.get("controller") is not None
+        job = Job(list(overrides), Path(), reported=read)
         try:
             job.folder = Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir)).absolute()
             if self.remote and "device" in config:
@@ -233,13 +246,19 @@ def _importable() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _progress(jobs: Sequence[Job]) -> Iterator[None]:
-    """A bar that counts the runs that have ended, by what is in their folders; their own output is in their logs."""
-    since, ends = time.time(), threading.Event()
+    """A bar and a line for every run that has ended, by what is in their folders; their own output is in their logs."""
+    since, ends, rest = time.time(), threading.Event(), list(zip(own_names(jobs), jobs, strict=True))
     with tqdm(total=len(jobs), unit="run", disable=None) as bar:
+
+        def look() -> None:
+            for name, job in [entry for entry in rest if entry[1].done(since)]:
+                rest.remove((name, job))
+                bar.update()
+                tqdm.write(f"{len(jobs) - len(rest)} of {len(jobs)} ended: {name} {ending(job)}")
 
         def watch() -> None:
             while not ends.wait(1.0):
-                bar.update(sum(job.done(since) for job in jobs) - bar.n)
+                look()
 
         thread = threading.Thread(target=watch, daemon=True)
         thread.start()
@@ -248,21 +267,27 @@ def _progress(jobs: Sequence[Job]) -> Iterator[None]:
         finally:
             ends.set()
             thread.join()
-            bar.update(sum(job.done(since) for job in jobs) - bar.n)
+            look()
 
 
 @contextlib.contextmanager
 def checked_sweeps() -> Iterator[None]:
-    """Context in which Hydra's sweepers start their runs through :class:`SweepLauncher`."""
-    instantiate = Plugins.instantiate_launcher
+    """Context in which Hydra's sweepers start their runs through :class:`SweepLauncher`; its end says what has come of runs
+    in other processes, whose output nobody has seen.
+    """
+    instantiate, launchers = Plugins.instantiate_launcher, []
 
     def wrapped(
         plugins: Plugins, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> Launcher:
         check_launcher(str(config.hydra.runtime.choices["hydra/launcher"]), config.hydra.launcher)
         inner = instantiate(plugins, hydra_context=hydra_context, task_function=task_function, config=config)
-        return SweepLauncher(inner, config, hydra_context)
+        launchers.append(SweepLauncher(inner, config, hydra_context))
+        return launchers[-1]
 
     FAILED_JOBS.clear()
     with replaced(Plugins, "instantiate_launcher", wrapped):
         yield
+    for launcher in launchers:
+        if launcher.launched and not launcher.basic:
+            tqdm.write(conclusion(launcher.launched, len(FAILED_JOBS)))
