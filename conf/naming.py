@@ -57,7 +57,8 @@ def _plain(cfg: DictConfig, name: str) -> Any:
 def evaluation_folder(cfg: DictConfig) -> str:
     """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers.
 
-    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten.
+    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten, and a filter that is
+    chosen its name. Folders from before it did are gone on with.
     """
     choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
     world, horizon = choices.env, cfg.env.horizon
@@ -66,11 +67,14 @@ def evaluation_folder(cfg: DictConfig) -> str:
         world = OmegaConf.load(hydra_folder / "hydra.yaml").hydra.runtime.choices.env
         if not any(entry.startswith("env.horizon=") for entry in overrides):
             horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
-    name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    size = f"{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    name = f"{world}_{size}"
     names = ("env", "safety", "checkpoint", *(name for name in COMPUTED if cfg[name]))
     changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in names]
     if cfg.run is not None:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
-        return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
+        folder = Path(cfg.run).absolute() / "eval"
+        chosen = any(entry.startswith("safety=") for entry in changes) and not (folder / f"{name}{suffix}").is_dir()
+        return str(folder / (f"{world}_{choices.safety}_{size}{suffix}" if chosen else f"{name}{suffix}"))
     folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
     return str(Path(cfg.folder).absolute() / folder)

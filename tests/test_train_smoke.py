@@ -114,10 +114,15 @@ def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
     arguments = (f"run={folder}", "steps=30", "num_envs=3", "pictures=false")
     code, output = program(evaluate.main, *arguments, f"checkpoint={first}", "safety=none")
     assert code == 0, output
-    (other,) = folder.glob("eval/default_30_0_*/eval.json")  # the run's own evaluation is not overwritten
+    (other,) = folder.glob("eval/default_none_30_0_*/eval.json")  # the run's own evaluation is not overwritten
     assert json.loads(other.read_text())["policy"].endswith(first)
     assert json.loads(other.read_text())["safety"]["mode"] == "none"
     assert json.loads((target / "eval.json").read_text()) == result
+    former = other.parent.rename(
+        other.parent.with_name(other.parent.name.replace("none_", ""))
+    )  # before it had the name
+    code, output = program(evaluate.main, *arguments, f"checkpoint={first}", "safety=none", "resume=auto")
+    assert f"{former}/eval.json exists: nothing to do" in output
     code, output = program(evaluate.main, f"run={folder}", "checkpoint=missing.pt")
     assert code == 1
     assert "missing.pt does not exist" in " ".join(output.split())
