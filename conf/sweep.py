@@ -63,6 +63,8 @@ class SweepLauncher(Launcher):
         self.remote = "Slurm" in type(inner).__name__ or "Ray" in type(inner).__name__  # other machines, other devices
         self.stopped: int | None = None
         self.launched: list[Job] = []
+        folder = Path(str(config.hydra.sweep.dir)).absolute()
+        self.missing = [path for path in (folder, *folder.parents) if not path.exists()]
         subdir = OmegaConf.to_container(config.hydra.sweep, resolve=False)["subdir"]  # pyright: ignore
         self.numbered = "hydra.job" in str(subdir)  # folders by number: no run may be left out of the list
         self._planned: dict[tuple[str, ...], Job] = {}
@@ -105,6 +107,16 @@ class SweepLauncher(Launcher):
             with self._stop_file(), _progress(todo), _importable(), patient(self.inner):
                 self._start_all(todo, initial_job_idx)
         return self._conclude(jobs, first)
+
+    def leave_nothing(self) -> None:
+        """Delete the sweep's folder, and those made for it, if the sweeper has written its configuration there and no run came."""
+        if not self.missing or not self.missing[0].is_dir():
+            return
+        if [path.name for path in self.missing[0].iterdir()] == ["multirun.yaml"]:
+            (self.missing[0] / "multirun.yaml").unlink()
+            with contextlib.suppress(OSError):  # not empty: somebody else's by now
+                for path in self.missing:
+                    path.rmdir()
 
     def _plan(self, overrides: Sequence[str], number: int) -> Job:
         """Compose one run and check it, as its own process will."""
@@ -286,8 +298,12 @@ def checked_sweeps() -> Iterator[None]:
         return launchers[-1]
 
     FAILED_JOBS.clear()
-    with replaced(Plugins, "instantiate_launcher", wrapped):
-        yield
+    try:
+        with replaced(Plugins, "instantiate_launcher", wrapped):
+            yield
+    finally:
+        for launcher in launchers:
+            launcher.leave_nothing()
     for launcher in launchers:
         if launcher.launched and not launcher.basic:
             tqdm.write(conclusion(launcher.launched, len(FAILED_JOBS)))

@@ -272,7 +272,10 @@ def test_bad_runs_in_several_batches_are_all_named(program, tmp_path):
     assert code == 1
     assert "3 of the sweep's runs failed" in output
     assert all(f"agent.gamma={value}.0 is out of range" in output for value in (2, 3, 4))
-    assert not list(tmp_path.rglob("run.log"))
+    assert not list(tmp_path.iterdir())  # no run, no folder
+    (tmp_path / "runs" / "smoke").mkdir(parents=True)
+    program(train.main, "-m", *TINY, "agent.gamma=2,3")
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["multirun.yaml"]  # of a folder that was there
 
 
 @pytest.mark.parametrize(
