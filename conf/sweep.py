@@ -60,6 +60,10 @@ class SweepLauncher(Launcher):
     def __init__(self, inner: Launcher, config: DictConfig, hydra_context: HydraContext) -> None:
         self.inner, self.config, self.hydra_context = inner, config, hydra_context
         self.basic = isinstance(inner, BasicLauncher)
+        # by name: Hydra loads its plugins' modules anew, and with them their classes
+        self.beside = not str(config.hydra.launcher._target_).endswith(
+            ".BasicLauncher"
+        )  # runs in other processes, with logs
         self.remote = "Slurm" in type(inner).__name__ or "Ray" in type(inner).__name__  # other machines, other devices
         self.stopped: int | None = None
         self.launched: list[Job] = []
@@ -104,7 +108,7 @@ class SweepLauncher(Launcher):
         if todo and self.basic:
             self._start(todo, initial_job_idx)
         elif todo:
-            with self._stop_file(), _progress(todo), _importable(), patient(self.inner):
+            with self._stop_file(), _progress(todo, tell=self.beside), _importable(), patient(self.inner):
                 self._start_all(todo, initial_job_idx)
         return self._conclude(jobs, first)
 
@@ -257,8 +261,10 @@ def _importable() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress(jobs: Sequence[Job]) -> Iterator[None]:
-    """A bar and a line for every run that has ended, by what is in their folders; their own output is in their logs."""
+def _progress(jobs: Sequence[Job], *, tell: bool) -> Iterator[None]:
+    """A bar that counts the runs that have ended, by what is in their folders; with ``tell`` a line for each, whose own output
+    is in its log.
+    """
     since, ends, rest = time.time(), threading.Event(), list(zip(own_names(jobs), jobs, strict=True))
     with tqdm(total=len(jobs), unit="run", disable=None) as bar:
 
@@ -266,7 +272,8 @@ def _progress(jobs: Sequence[Job]) -> Iterator[None]:
             for name, job in [entry for entry in rest if entry[1].done(since)]:
                 rest.remove((name, job))
                 bar.update()
-                tqdm.write(f"{len(jobs) - len(rest)} of {len(jobs)} ended: {name} {ending(job)}")
+                if tell:
+                    tqdm.write(f"{len(jobs) - len(rest)} of {len(jobs)} ended: {name} {ending(job)}")
 
         def watch() -> None:
             while not ends.wait(1.0):
@@ -305,5 +312,5 @@ def checked_sweeps() -> Iterator[None]:
         for launcher in launchers:
             launcher.leave_nothing()
     for launcher in launchers:
-        if launcher.launched and not launcher.basic:
+        if launcher.beside and not all(job.error for job in launcher.launched):
             tqdm.write(conclusion(launcher.launched, len(FAILED_JOBS)))

@@ -323,5 +323,7 @@ def test_one_bad_job_of_a_sweep(program, tmp_path):
     assert code == 1
     assert "1 of the sweep's runs failed; the others are complete" in output
     assert "env.n_agents=0 agent.gamma=0.9: env.n_agents=0 is out of range" in output
+    assert "ended: " not in output  # the runs' own output is there
+    assert "runs complete in" not in output
     assert "Traceback" not in output
     assert len(list(tmp_path.glob("runs/smoke/*/summary.json"))) == len(list(tmp_path.glob("runs/smoke/*/"))) == 1
