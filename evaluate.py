@@ -39,7 +39,8 @@ from envs.video import save_gif, save_mp4
 from safety import SafetyConfig, SafetyFilter
 
 register()
-logging.getLogger("torchrl").setLevel(logging.WARNING)
+for library in ("torchrl", "fontTools"):  # the latter tells of every glyph table that format=pdf leaves out
+    logging.getLogger(library).setLevel(logging.WARNING)
 
 
 @clear_errors(EvaluateConfig)

@@ -2,15 +2,20 @@
 
 import os
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
 from envs import SurveillanceEnv
+from envs.observation import observation_fields
 
 FORMAT = 2
 READABLE = (1, 2)  # format 1 holds the networks, but not all that a run needs to go on
-WORLD_REMEDY = "Use the world that the run was trained in (leave env out), or train in this one."
+WORLD_REMEDY = (
+    "A policy fits worlds with the same observation: use the world that the run was trained in (leave env out), or train in "
+    "this one."
+)
 
 
 class CheckpointError(ValueError):
@@ -180,7 +185,20 @@ def world_sizes(env: SurveillanceEnv) -> dict[str, int]:
     return {"n_agents": env.config.n_agents, "dimension": env.config.dimension, "n_observation": env.n_observation}
 
 
-def check_world(path: Path, found: dict, needed: dict, remedy: str = WORLD_REMEDY) -> None:
+def observed_difference(there: SurveillanceEnv, here: SurveillanceEnv) -> str:
+    """Which fields of the observation have other sizes in another world, with the sizes; empty if none."""
+    sizes = [
+        {name: part.stop - part.start for name, part in observation_fields(env.config, env.density).items()}
+        for env in (there, here)
+    ]
+    return "; ".join(
+        f"{name} {size} there, {sizes[1][name]} here" for name, size in sizes[0].items() if size != sizes[1][name]
+    )
+
+
+def check_world(
+    path: Path, found: dict, needed: dict, remedy: str = WORLD_REMEDY, observed: Callable[[], str] = str
+) -> None:
     """Compare the sizes that a checkpoint's networks were made for with the world they are to be used in.
 
     Args:
@@ -188,6 +206,7 @@ def check_world(path: Path, found: dict, needed: dict, remedy: str = WORLD_REMED
         found: sizes stored in the checkpoint.
         needed: sizes of the present world.
         remedy: what the message advises.
+        observed: asked only if they differ: in which fields of the observation, where that is known.
 
     Raises:
         CheckpointError: naming each size that differs.
@@ -196,4 +215,5 @@ def check_world(path: Path, found: dict, needed: dict, remedy: str = WORLD_REMED
         f"{name} is {found.get(name)} there, {value} here" for name, value in needed.items() if found.get(name) != value
     ]
     if different:
-        raise CheckpointError(f"checkpoint {path} is of another world: {'; '.join(different)}. {remedy}")
+        fields = f" ({text})" if (text := observed()) else ""
+        raise CheckpointError(f"checkpoint {path} is of another world: {'; '.join(different)}{fields}. {remedy}")

@@ -20,27 +20,30 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from agents.evaluation import rollout_steps
 
-# Overrides that belong to the world or to no method: they do not name one.
-UNNAMED = {
+# Settings that do not change what is computed by a run of a given seed.
+NOT_HASHED = (
     "seed",
     "seeds",
     "n_seeds",
-    "env",
     "device",
     "threads",
+    "deterministic",
     "resume",
     "debug",
-    "compile",
-    "fixed_sizes",
-    "cuda_graphs",
     "checkpoint",
-    "eval",
+    "log",
     "hydra",
-    "experiment",
-    "method",
+    "folder",
+    *("video", "format", "samples"),  # of evaluate.py's pictures
+)
+# Overrides that belong to the world or to no method: they do not name one.
+UNNAMED = {
+    *NOT_HASHED,
+    *("env", "eval", "experiment", "method"),
+    *("compile", "fixed_sizes", "cuda_graphs"),
     *("workers.backend", "workers.ray_address", "workers.gpus"),
 }
-UNNAMED_EVALUATION = UNNAMED | {"controller", "folder", "steps", "num_envs", "pictures", "restart"}
+UNNAMED_EVALUATION = UNNAMED | {"controller", "steps", "num_envs", "pictures", "restart"}
 SHOWN = 3  # names per problem in an error: messages have at most 8 lines
 
 
@@ -55,13 +58,16 @@ class Run:
     folder: Path
     name: str  # path below the sweep
     world: str
-    method: str
+    method: str  # the same for all runs of a configuration, however it was given
     seed: int
     learned: bool  # by train.py; otherwise a controller's evaluation
     config_hash: str
     env: dict  # the world's configuration
     protocol: str  # how J was measured
     n_agents: int
+    base: str = ""  # what the method's name begins with, if anything
+    settings: list[str] = field(default_factory=list)  # overrides that it ends with
+    shared: list[str] = field(default_factory=list)  # those that no name needs: every trained method has them
     git_hash: str = ""
     finished: bool = False
     numbers: dict[str, float] = field(default_factory=dict)
@@ -92,7 +98,33 @@ def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run
         raise ReportError(
             f"sweep={sweep} holds no runs: no folder below it was written by train.py or by evaluate.py controller=…"
         )
+    _name_alike(found)
+    _leave_out_shared([run for run in found if run.learned])
     return sorted(found, key=lambda run: (run.world, run.method, run.seed, run.name))
+
+
+def _name_alike(runs: list[Run]) -> None:
+    """Give the runs of one configuration the shortest of their worlds' and methods' names: values may be given as overrides that
+    are the defaults.
+    """
+    alike = defaultdict(list)
+    for run in runs:
+        alike[run.config_hash].append(run)
+    for group in alike.values():
+        world = min((run.world for run in group), key=lambda name: (len(name), name))
+        named = min(group, key=lambda run: (len(run.method), run.method))
+        for run in group:
+            run.world, run.method, run.base, run.settings = world, named.method, named.base, named.settings
+
+
+def _leave_out_shared(runs: list[Run]) -> None:
+    """Shorten the names of several trained methods by the overrides that all of them have."""
+    if len({run.method for run in runs}) < 2:
+        return
+    shared = sorted(set.intersection(*(set(run.settings) for run in runs)))
+    for run in runs:
+        run.settings, run.shared = [entry for entry in run.settings if entry not in shared], shared
+        run.method = _label(run.base, run.settings)
 
 
 def run_folders(sweep: Path) -> Iterable[Path]:
@@ -122,17 +154,20 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
     choices, overrides = hydra.runtime.choices, [str(entry).lstrip("+~") for entry in hydra.overrides.task]
     steps = (config.eval.steps if learned else config.steps) or rollout_steps(config.env.horizon)
     restart = ", worlds drawn anew after a violation" if config.get("restart") else ""
+    base, settings = _method(config, choices, overrides)
     run = Run(
         folder=folder,
         name=folder.relative_to(sweep).as_posix(),
         world=" ".join([choices.env, *sorted(entry[4:] for entry in overrides if _names_world(entry))]),
-        method=_method(config, choices, overrides),
+        method=_label(base, settings),
         seed=config.seed,
         learned=learned,
         config_hash=config_hash(config),
         env=OmegaConf.to_container(config.env),
         protocol=f"{steps} steps{restart}",
         n_agents=config.env.n_agents,
+        base=base,
+        settings=settings,
         others=sorted(path.parent.relative_to(sweep).as_posix() for path in folder.glob("eval/*/eval.json")),
     )
     path = folder / ("summary.json" if learned else "eval.json")
@@ -147,15 +182,20 @@ def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]
     return run
 
 
-def _method(config: DictConfig, choices: DictConfig, overrides: list[str]) -> str:
-    """Name of what is compared: the choice of group ``method``, a controller and its filter, or the overrides."""
+def _method(config: DictConfig, choices: DictConfig, overrides: list[str]) -> tuple[str, list[str]]:
+    """What is compared: the choice of group ``method``, a controller and its filter, or an experiment; and its overrides."""
     if choices.get("method", "default") != "default":
-        return " ".join([choices.method, *_named(overrides, UNNAMED)])
+        return choices.method, _named(overrides, UNNAMED)
     if config.get("controller") is not None:
         own = [entry for entry in overrides if not entry.startswith("safety=")]
-        return " ".join([f"{config.controller} + {choices.safety}", *_named(own, UNNAMED_EVALUATION)])
-    experiment = [choices.experiment] if any(entry.startswith("experiment=") for entry in overrides) else []
-    return " ".join([*experiment, *_named(overrides, UNNAMED)]) or choices.experiment
+        return f"{config.controller} + {choices.safety}", _named(own, UNNAMED_EVALUATION)
+    given = any(entry.startswith("experiment=") for entry in overrides)
+    return choices.experiment if given else "", _named(overrides, UNNAMED)
+
+
+def _label(base: str, settings: list[str]) -> str:
+    """A method's name."""
+    return " ".join(filter(None, [base, *settings])) or "default"
 
 
 def _names_world(override: str) -> bool:

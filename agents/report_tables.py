@@ -106,6 +106,8 @@ class Report:
             f"# {title}\n",
             f"{len(runs)} runs, seeds {', '.join(map(str, sorted({run.seed for run in runs})))}.\n",
         ]
+        if shared := sorted({entry for run in runs for entry in run.shared}):
+            parts.append(f"All trained methods have {', '.join(shared)}; their names leave it out.\n")
         if warnings:
             parts.append("## Warnings\n\n" + "".join(f"* {line}\n" for line in warnings))
         worlds = self.groups.worlds

@@ -24,6 +24,7 @@ QUOTING = (
     "An override is name=value, or group=option; values with spaces, commas, = or brackets need quotes for Hydra inside quotes "
     "for the shell: 'name=\"a value\"'. python <program> --help lists the options."
 )
+BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell has it
 ENTRY = {"command_line.py", "sweep.py", "train.py", "evaluate.py", "report.py"}
 
 
@@ -35,7 +36,7 @@ def wants_traceback() -> bool:
 def fail(error: BaseException | str) -> None:
     """Print one message of at most 8 lines and leave with exit code 1."""
     text = str(error).splitlines() or [type(error).__name__]
-    lines = [line for part in text for line in textwrap.wrap(part, 110)][:7]
+    lines = [line for part in text for line in textwrap.wrap(part, 110, break_on_hyphens=False)][:7]
     sys.stderr.write("\n".join(["error: " + lines[0], *("  " + line for line in lines[1:])]) + "\n")
     sys.exit(1)
 
@@ -68,9 +69,14 @@ def clear_errors(schema: type) -> Callable[[Callable[[], None]], Callable[[], No
 
 
 def _explain(main: Callable[[], None], schema: type) -> None:
-    """Run ``main``; what Hydra refuses ends in one message."""
+    """Run ``main``; what Hydra refuses ends in one message, a reader that has read enough (head) in none."""
     try:
         main()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # the interpreter would complain of what is left to write
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit(BROKEN_PIPE)
     except (HydraException, OmegaConfBaseException) as error:
         if not FAILED_JOBS:
             fail(describe(error, schema))
@@ -139,8 +145,10 @@ def describe(error: BaseException, schema: type) -> str:
         key = getattr(cause, "full_key", None) or override.split("=")[0].lstrip("+~")
         return f"{override}: {why}.\n{explain(schema, str(key).split('[')[0])}"
     if match := re.match(r"Could not (?:override|append to config|delete from config)\.? ?'?([^'\s]*)", text):
-        key = getattr(cause, "full_key", None) or match.group(1)
-        return f"{why}.\n{explain(schema, str(key))} python <program> --help lists all options."
+        key = max(
+            match.group(1), str(getattr(cause, "full_key", None) or ""), key=len
+        )  # the cause may name its group only
+        return f"{why.rstrip('.')}.\n{explain(schema, key)} python <program> --help lists all options."
     if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
         key = str(getattr(cause or error, "full_key", None) or "hydra")
         return text if key.startswith("hydra") else f"{why}\n{explain(schema, key)}"

@@ -84,12 +84,19 @@ class EvaluateConfig:
         for name in ("run", "adversary"):
             folder = getattr(self, name)
             if folder is not None and not (Path(folder) / ".hydra" / "config.yaml").is_file():
-                raise ValueError(
-                    f"{name}={folder} is not the folder of a run: {folder}/.hydra/config.yaml does not exist."
-                )
+                raise ValueError(_not_a_run(name, Path(folder)))
         self.safety.gains(self.env)
 
     @property
     def computing(self) -> dict[str, bool]:
         """How worlds and filter compute, as :attr:`agents.training_config.Config.computing`."""
         return computing(self.compile, fixed_sizes=self.fixed_sizes, cuda_graphs=self.cuda_graphs)
+
+
+def _not_a_run(name: str, path: Path) -> str:
+    """What is wrong with ``path``, and the run's folder where it lies in one, such as a checkpoint does."""
+    run = next((folder for folder in path.parents if (folder / ".hydra" / "config.yaml").is_file()), None)
+    if run is None:
+        return f"{name}={path} is not the folder of a run: {path}/.hydra/config.yaml does not exist."
+    named = f" checkpoint={path.name}" if name == "run" and path.suffix == ".pt" else ""
+    return f"{name}={path} is inside the folder of a run; {name}= takes the folder itself: use {name}={run}{named}."

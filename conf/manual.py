@@ -12,6 +12,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from conf.naming import GROUPS
+
 WIDTH = 110
 
 
@@ -88,10 +90,18 @@ def explain(schema: type, key: str) -> str:
         return f"{key}: {known[key]}"
     if inside := [name for name in known if name.startswith(f"{key}.")]:
         return f"{key} is a group; its options: {', '.join(inside)}."
-    near = difflib.get_close_matches(key, known, n=3, cutoff=0.6)
+    candidates = known if "." in key else [*known, *_files_of(schema)]
+    near = difflib.get_close_matches(key, candidates, n=3, cutoff=0.6)
     ending = [name for name in known if name.split(".")[-1] == key.split(".")[-1]]
+    ending.sort(key=lambda name: difflib.SequenceMatcher(None, key, name).ratio(), reverse=True)
     guess = list(dict.fromkeys([*ending, *near]))[:4]
-    return f"There is no option {key!r}. " + (f"Did you mean {' or '.join(guess)}?" if guess else "")
+    return f"There is no option {key!r}." + (f" Did you mean {' or '.join(guess)}?" if guess else "")
+
+
+def _files_of(schema: type) -> list[str]:
+    """The groups of files that a program can choose from; those that are no part of a configuration are train.py's."""
+    parts = {entry.name for entry in dataclasses.fields(schema)}
+    return [name for name in GROUPS if name in parts or "train" in parts]
 
 
 def check_names(cfg: DictConfig, prefix: str = "", schema: type | None = None) -> None:

@@ -8,24 +8,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from agents.evaluation import rollout_steps
+from agents.report_runs import NOT_HASHED
 from agents.training_config import seeds_of
-
-# Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = (
-    "seed",
-    "seeds",
-    "n_seeds",
-    "device",
-    "threads",
-    "deterministic",
-    "resume",
-    "debug",
-    "checkpoint",
-    "log",
-    "hydra",
-    "folder",
-    *("video", "format", "samples"),  # of evaluate.py's pictures
-)
 
 COMPUTED = ("fixed_sizes", "cuda_graphs")
 """How a run computes, where not as by default."""
@@ -33,12 +17,12 @@ GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
 
 def config_hash(cfg: DictConfig) -> str:
-    """First 8 hex digits of a digest of the resolved configuration without :data:`NOT_HASHED`."""
+    """First 8 hex digits of a digest of the resolved configuration without :data:`agents.report_runs.NOT_HASHED`."""
     return hashlib.sha256(json.dumps(hashed_config(cfg), sort_keys=True).encode()).hexdigest()[:8]
 
 
 def hashed_config(cfg: DictConfig) -> dict:
-    """The resolved configuration without :data:`NOT_HASHED`, nested; workers, fixed sizes and graphs only where there are some."""
+    """The resolved configuration without ``NOT_HASHED``, nested; workers, fixed sizes and graphs only where there are some."""
     found = {name: _plain(cfg, name) for name in sorted(str(name) for name in cfg) if name not in NOT_HASHED}
     workers = found.pop("workers", {"count": 0})  # where and on what they run changes nothing
     kept = {"workers": {name: workers[name] for name in ("count", "overlap")}} if workers["count"] else {}
@@ -73,7 +57,8 @@ def _plain(cfg: DictConfig, name: str) -> Any:
 def evaluation_folder(cfg: DictConfig) -> str:
     """Where evaluate.py writes: ``<run>/eval/<world>_<steps>_<seed>``, or a folder under runs/ for controllers.
 
-    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten.
+    Overrides of the run's own world, filter or checkpoint add a hash, so that nothing is overwritten, and a filter that is
+    chosen its name. Folders from before it did are gone on with.
     """
     choices, overrides = cfg.hydra.runtime.choices, [str(entry) for entry in cfg.hydra.overrides.task]
     world, horizon = choices.env, cfg.env.horizon
@@ -82,11 +67,14 @@ def evaluation_folder(cfg: DictConfig) -> str:
         world = OmegaConf.load(hydra_folder / "hydra.yaml").hydra.runtime.choices.env
         if not any(entry.startswith("env.horizon=") for entry in overrides):
             horizon = OmegaConf.load(hydra_folder / "config.yaml").env.horizon
-    name = f"{world}_{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    size = f"{cfg.steps or rollout_steps(horizon)}_{cfg.seed}"
+    name = f"{world}_{size}"
     names = ("env", "safety", "checkpoint", *(name for name in COMPUTED if cfg[name]))
     changes = [entry for entry in overrides if entry.split(".")[0].split("=")[0] in names]
     if cfg.run is not None:
         suffix = "_" + hashlib.sha256("\n".join(sorted(changes)).encode()).hexdigest()[:8] if changes else ""
-        return str(Path(cfg.run).absolute() / "eval" / f"{name}{suffix}")
+        folder = Path(cfg.run).absolute() / "eval"
+        chosen = any(entry.startswith("safety=") for entry in changes) and not (folder / f"{name}{suffix}").is_dir()
+        return str(folder / (f"{world}_{choices.safety}_{size}{suffix}" if chosen else f"{name}{suffix}"))
     folder = f"{cfg.controller}_{choices.safety}_{name}_{config_hash(cfg)}"
     return str(Path(cfg.folder).absolute() / folder)

@@ -9,7 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from agents import make_controller
-from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, world_sizes
+from agents.checkpoint import check_world, find_checkpoint, load_checkpoint, observed_difference, world_sizes
 from agents.ray_cluster import reach_ray
 from agents.training_config import Config, WorkersConfig
 from agents.training_state import MAY_DIFFER, check_frames, check_origin, named_checkpoint
@@ -105,4 +105,9 @@ def check_evaluation(cfg: DictConfig) -> None:
         make_controller("learned", config.env, adversary=config.adversary)  # its checkpoint and the world's sizes
     if config.run is not None:
         path = find_checkpoint(Path(config.run), config.checkpoint)
-        check_world(path, load_checkpoint(path)["world"], world_sizes(SurveillanceEnv(source.env)))
+        here = SurveillanceEnv(source.env)
+
+        def observed() -> str:
+            return observed_difference(SurveillanceEnv(run_config(cfg, []).env), here)
+
+        check_world(path, load_checkpoint(path)["world"], world_sizes(here), observed=observed)

@@ -30,7 +30,17 @@ from agents.training_config import seeds_of
 from conf.job_log import LOG, FailedRunError, read_failure
 from conf.launching import SweepError, check_launcher, is_broken_pool, patient, replaced
 from conf.run_folder import finished_run, foreign_run, objective, run_folders
-from conf.sweep_jobs import FAILED_JOBS, FailedJob, Job, is_listed, list_jobs, refuse_shared_folders
+from conf.sweep_jobs import (
+    FAILED_JOBS,
+    FailedJob,
+    Job,
+    conclusion,
+    ending,
+    is_listed,
+    list_jobs,
+    own_names,
+    refuse_shared_folders,
+)
 
 EXPECTED = (ValueError, OSError, OmegaConfBaseException)  # of a configuration that is being checked
 
@@ -50,8 +60,15 @@ class SweepLauncher(Launcher):
     def __init__(self, inner: Launcher, config: DictConfig, hydra_context: HydraContext) -> None:
         self.inner, self.config, self.hydra_context = inner, config, hydra_context
         self.basic = isinstance(inner, BasicLauncher)
+        # by name: Hydra loads its plugins' modules anew, and with them their classes
+        self.beside = not str(config.hydra.launcher._target_).endswith(
+            ".BasicLauncher"
+        )  # runs in other processes, with logs
         self.remote = "Slurm" in type(inner).__name__ or "Ray" in type(inner).__name__  # other machines, other devices
         self.stopped: int | None = None
+        self.launched: list[Job] = []
+        folder = Path(str(config.hydra.sweep.dir)).absolute()
+        self.missing = [path for path in (folder, *folder.parents) if not path.exists()]
         subdir = OmegaConf.to_container(config.hydra.sweep, resolve=False)["subdir"]  # pyright: ignore
         self.numbered = "hydra.job" in str(subdir)  # folders by number: no run may be left out of the list
         self._planned: dict[tuple[str, ...], Job] = {}
@@ -76,6 +93,7 @@ class SweepLauncher(Launcher):
         jobs = []
         for number, overrides in enumerate(job_overrides, initial_job_idx):
             jobs.append(self._planned.get(tuple(overrides)) or self._plan(overrides, number))
+        self.launched += jobs
         todo, first = [], {}
         for job in jobs:
             if job.error is None and first.setdefault(job.folder, job) is not job:
@@ -90,16 +108,27 @@ class SweepLauncher(Launcher):
         if todo and self.basic:
             self._start(todo, initial_job_idx)
         elif todo:
-            with self._stop_file(), _progress(todo), _importable(), patient(self.inner):
+            with self._stop_file(), _progress(todo, tell=self.beside), _importable(), patient(self.inner):
                 self._start_all(todo, initial_job_idx)
         return self._conclude(jobs, first)
+
+    def leave_nothing(self) -> None:
+        """Delete the sweep's folder, and those made for it, if the sweeper has written its configuration there and no run came."""
+        if not self.missing or not self.missing[0].is_dir():
+            return
+        if [path.name for path in self.missing[0].iterdir()] == ["multirun.yaml"]:
+            (self.missing[0] / "multirun.yaml").unlink()
+            with contextlib.suppress(OSError):  # not empty: somebody else's by now
+                for path in self.missing:
+                    path.rmdir()
 
     def _plan(self, overrides: Sequence[str], number: int) -> Job:
         """Compose one run and check it, as its own process will."""
         config = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
         with open_dict(config):
             config.hydra.job.num, config.hydra.job.id = number, str(number)
-        job = Job(list(overrides), Path())
+        read = "collector" in config or config.get("controller") is not None
+        job = Job(list(overrides), Path(), reported=read)
         try:
             job.folder = Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir)).absolute()
             if self.remote and "device" in config:
@@ -232,14 +261,23 @@ def _importable() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress(jobs: Sequence[Job]) -> Iterator[None]:
-    """A bar that counts the runs that have ended, by what is in their folders; their own output is in their logs."""
-    since, ends = time.time(), threading.Event()
+def _progress(jobs: Sequence[Job], *, tell: bool) -> Iterator[None]:
+    """A bar that counts the runs that have ended, by what is in their folders; with ``tell`` a line for each, whose own output
+    is in its log.
+    """
+    since, ends, rest = time.time(), threading.Event(), list(zip(own_names(jobs), jobs, strict=True))
     with tqdm(total=len(jobs), unit="run", disable=None) as bar:
+
+        def look() -> None:
+            for name, job in [entry for entry in rest if entry[1].done(since)]:
+                rest.remove((name, job))
+                bar.update()
+                if tell:
+                    tqdm.write(f"{len(jobs) - len(rest)} of {len(jobs)} ended: {name} {ending(job)}")
 
         def watch() -> None:
             while not ends.wait(1.0):
-                bar.update(sum(job.done(since) for job in jobs) - bar.n)
+                look()
 
         thread = threading.Thread(target=watch, daemon=True)
         thread.start()
@@ -248,21 +286,31 @@ def _progress(jobs: Sequence[Job]) -> Iterator[None]:
         finally:
             ends.set()
             thread.join()
-            bar.update(sum(job.done(since) for job in jobs) - bar.n)
+            look()
 
 
 @contextlib.contextmanager
 def checked_sweeps() -> Iterator[None]:
-    """Context in which Hydra's sweepers start their runs through :class:`SweepLauncher`."""
-    instantiate = Plugins.instantiate_launcher
+    """Context in which Hydra's sweepers start their runs through :class:`SweepLauncher`; its end says what has come of runs
+    in other processes, whose output nobody has seen.
+    """
+    instantiate, launchers = Plugins.instantiate_launcher, []
 
     def wrapped(
         plugins: Plugins, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> Launcher:
         check_launcher(str(config.hydra.runtime.choices["hydra/launcher"]), config.hydra.launcher)
         inner = instantiate(plugins, hydra_context=hydra_context, task_function=task_function, config=config)
-        return SweepLauncher(inner, config, hydra_context)
+        launchers.append(SweepLauncher(inner, config, hydra_context))
+        return launchers[-1]
 
     FAILED_JOBS.clear()
-    with replaced(Plugins, "instantiate_launcher", wrapped):
-        yield
+    try:
+        with replaced(Plugins, "instantiate_launcher", wrapped):
+            yield
+    finally:
+        for launcher in launchers:
+            launcher.leave_nothing()
+    for launcher in launchers:
+        if launcher.beside and not all(job.error for job in launcher.launched):
+            tqdm.write(conclusion(launcher.launched, len(FAILED_JOBS)))

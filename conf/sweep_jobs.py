@@ -1,5 +1,6 @@
-"""The runs of a sweep as a list: what is known of each before it starts, and lists that are refused."""
+"""The runs of a sweep as a list: what is known of each before it starts and when it ends, and lists that are refused."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from conf.job_log import FAILED
+from conf.job_log import FAILED, LOG
 from conf.launching import SweepError
+from conf.run_folder import objective
 
 SUMMARIES = ("summary.json", "eval.json")
 
@@ -42,12 +44,9 @@ class Job:
     """What to tell the user if it is finished and left alone."""
     error: BaseException | None = None
     """What is wrong with its configuration."""
+    reported: bool = False
+    """Whether report.py reads its runs: trainings and controllers' evaluations."""
     result: JobReturn | None = None
-
-    @property
-    def name(self) -> str:
-        """The overrides as the user would write them."""
-        return " ".join(self.overrides)
 
     def done(self, since: float) -> bool:
         """Whether it has ended since that time."""
@@ -65,6 +64,30 @@ class Job:
     def end(self, status: JobStatus, value: Any) -> None:
         """Set its result."""
         self.result = JobReturn(overrides=list(self.overrides), status=status, _return_value=value)
+
+
+def own_names(jobs: Sequence[Job]) -> list[str]:
+    """What the user would call each: its overrides, without those that all have where there are several."""
+    shared = set.intersection(*(set(job.overrides) for job in jobs)) if len(jobs) > 1 else set()
+    return [" ".join(entry for entry in job.overrides if entry not in shared) for job in jobs]
+
+
+def ending(job: Job) -> str:
+    """How a job that has ended did so, in a few words."""
+    if (job.folder / FAILED).is_file():
+        return f"failed ({job.folder / LOG})"
+    cost = objective(job.folders)
+    return "complete" if cost is None else f"complete, J = {cost:.4g} m²"
+
+
+def conclusion(jobs: Sequence[Job], failed: int) -> str:
+    """What a sweep's end tells the user: how many runs are complete, where they are, and what reads them."""
+    folder = os.path.commonpath([job.folder.parent for job in jobs])
+    near = os.path.relpath(folder)
+    where = folder if near.startswith("..") else near
+    text = f"{len(jobs) - failed} of {len(jobs)} runs complete in {where} (each run's output: {LOG})"
+    read = len(jobs) > failed and all(job.reported for job in jobs)
+    return f"{text}; python report.py sweep={where}" if read else text
 
 
 def is_listed(config: DictConfig) -> bool:

@@ -7,6 +7,8 @@ import time
 from omegaconf import OmegaConf
 from torch.utils.tensorboard import SummaryWriter
 
+from conf.naming import config_hash
+
 KINDS = ("depleted", "stranded", "overcharged", "collision")
 FILTER = {"intervention_rate": 0.5, "fallback_rate": 0.03, "homing_rate": 0.01, "infeasible": 2, "outside": 1}
 METRICS = {"episode_reward": -20.0, "charges_per_robot": 1.5, "robot_steps": 60}
@@ -35,6 +37,9 @@ def write_run(
     else:
         config |= {"collector": {"total_frames": 100}, "eval": {"steps": changes.get("steps", 0)}}
         choices["experiment"] = experiment
+    config["chosen"] = changes.get(
+        "chosen", [world, method, experiment, *overrides[1:]]
+    )  # in place of what it would compose
     OmegaConf.save(config, folder / ".hydra" / "config.yaml")
     hydra = {"hydra": {"runtime": {"choices": choices}, "overrides": {"task": overrides}}}
     OmegaConf.save(hydra, folder / ".hydra" / "hydra.yaml")
@@ -47,7 +52,12 @@ def write_run(
         origin = {"git_hash": git_hash, "wall_time_s": 1.0, "steps": 20, "policy": controller, "env": config["env"]}
         (folder / "eval.json").write_text(json.dumps(test | {"filter": FILTER, "task": {"waypoints": 7}} | origin))
         return folder
-    content = {"config_hash": changes.get("config_hash", "c0ffee00"), "git_hash": git_hash, "seed": seed, "eval": test}
+    content = {
+        "config_hash": changes.get("config_hash", config_hash(OmegaConf.create(config))),
+        "git_hash": git_hash,
+        "seed": seed,
+        "eval": test,
+    }
     content |= {"frames": changes.get("frames", 100), "episodes": 5, "wall_time_s": 9.0, "frames_per_second": 11.0}
     content |= {"train": {"violations": dict.fromkeys(KINDS, seed)}, "filter": FILTER}
     content |= {"n_seeds": changes["n_seeds"]} if "n_seeds" in changes else {}

@@ -10,9 +10,11 @@ from agents.checkpoint import (
     check_world,
     latest_checkpoint,
     load_checkpoint,
+    observed_difference,
     save_checkpoint,
     set_aside,
 )
+from envs import SurveillanceConfig, SurveillanceEnv
 
 torch.set_num_threads(1)
 
@@ -136,6 +138,13 @@ def test_world_of_another_size(tmp_path):
     assert "n_observation is 28 there, 18 here" in message
     assert "dimension" not in message
     assert "leave env out" in message
+    moving = SurveillanceConfig(horizon=0, density="moving")
+    there, here = SurveillanceEnv(SurveillanceConfig()), SurveillanceEnv(moving)
+    fields = observed_difference(there, here)
+    assert fields == f"density 0 there, {here.density.n_observed} here; time 1 there, 0 here"
+    assert observed_difference(here, here) == ""
+    with pytest.raises(CheckpointError, match=r"n_observation is 28 there, 18 here \(density 0 there, "):
+        check_world(path, world | {"n_observation": 28}, world, observed=lambda: fields)
     with pytest.raises(CheckpointError, match="n_agents is None there, 3 here"):
         check_world(path, {"dimension": 2, "n_observation": 18}, world)
 

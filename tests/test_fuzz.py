@@ -6,6 +6,7 @@
 import os
 import random
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from conf.schema import Config
 COUNT = int(os.environ.get("FUZZ_CASES", "160"))
 CHUNKS = 8
 GROUPS = ("env", "safety", "agent", "train", "experiment", "method")
-CONF = Path(train.__file__).parent / "conf"
+ROOT = Path(train.__file__).parent
+CONF = ROOT / "conf"
 STRANGE = (
     *(
         "",
@@ -246,6 +248,13 @@ def test_every_controller_is_in_the_manual():
     [
         ("agent=foo", "error: agent=foo: group agent has no option 'foo'. Choose one of ddpg, maddpg, paper."),
         ("agent.lr=1", "Did you mean agent.actor_lr"),
+        (
+            "envs.n_agents=5",
+            "error: Key 'envs' not in 'Config'. There is no option 'envs.n_agents'. Did you mean env.n_agents",
+        ),
+        ("evn=ring", "There is no option 'evn'. Did you mean env?"),
+        ("methd=ddpg", "There is no option 'methd'. Did you mean method? python"),
+        ("colector.num_envs=5", "Did you mean collector.num_envs or eval.num_envs"),
         ("agent.actor_lr=abc", "agent.actor_lr: Learning rate of the actors (Adam), (0, 1]."),
         ("collector=5", "collector is a group; its options: collector.num_envs"),
         ("+agent.x=1", "There is no option 'agent.x'"),
@@ -268,6 +277,24 @@ def test_an_error_names_the_remedy(program, tmp_path, override, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_group_of_another_program_is_refused_in_whole_sentences(program):
+    code, output = program(evaluate.main, "controller=lloyd", "agent=ddpg")
+    assert code == 1
+    text = " ".join(output.split())
+    assert "Could not override 'agent'. No match in the defaults list. There is no option 'agent'. python" in text
+
+
+def test_a_reader_that_has_read_enough_ends_a_program_silently():
+    """As ``--help | head -3`` does, whatever of the text the pipe still takes."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "train.py", "--help"], cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, check=False
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
 def test_hydra_can_speak_for_itself(program, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(HydraException):
@@ -279,7 +306,8 @@ def test_unknown_options_are_guessed():
     assert "env.n_agents" in explain(Config, "env.num_agents")
     assert "Number of robots" in explain(Config, "env.n_agents")
     assert "collector.num_envs" in explain(Config, "collector")
-    assert explain(Config, "zzz").strip() == "There is no option 'zzz'."
+    assert explain(Config, "zzz") == "There is no option 'zzz'."
+    assert "method" not in explain(EvaluateConfig, "methd")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX shells")
@@ -295,5 +323,7 @@ def test_one_bad_job_of_a_sweep(program, tmp_path):
     assert code == 1
     assert "1 of the sweep's runs failed; the others are complete" in output
     assert "env.n_agents=0 agent.gamma=0.9: env.n_agents=0 is out of range" in output
+    assert "ended: " not in output  # the runs' own output is there
+    assert "runs complete in" not in output
     assert "Traceback" not in output
     assert len(list(tmp_path.glob("runs/smoke/*/summary.json"))) == len(list(tmp_path.glob("runs/smoke/*/"))) == 1

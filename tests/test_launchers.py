@@ -70,6 +70,10 @@ def check_sweep(folder, code, output):
     assert "Traceback" in (folder / "0.7" / "run.log").read_text()
     assert json.loads((folder / "0.7" / "failed.json").read_text())["overrides"][-1] == "agent.gamma=0.7"
     assert "frame/s" not in output  # no progress bars on top of each other
+    assert f"ended: agent.gamma=0.7 failed ({folder / '0.7' / 'run.log'})" in output
+    assert all(f"ended: agent.gamma={name} complete, J = " in output for name in ("0.8", "0.6"))
+    assert all(f"{k} of 3 ended: " in output for k in (1, 2, 3))
+    assert "3 of 4 runs complete in sweep (each run's output: run.log); python report.py sweep=sweep\n" in output
     assert "Traceback" not in output
     assert not list(folder.glob(".stop_*"))
 
@@ -79,6 +83,18 @@ def test_local(program, tmp_path):
     check_sweep(tmp_path / "sweep", code, output)
     code, output = program(report.main, "sweep=sweep", "resamples=100", "incomplete=true")
     assert code == 0, output
+
+
+def test_local_evaluations_end_with_what_reads_them(program, tmp_path):
+    code, output = program(train.main, *TINY, "hydra.run.dir=run")
+    assert code == 0, output
+    short = ("-m", "hydra/launcher=local", "steps=3", "num_envs=2", "pictures=false", "seed=0,1")
+    code, output = program(evaluate.main, *short, f"run={tmp_path}/run")  # its processes may be the last test's
+    assert code == 0, output
+    assert "1 of 2 ended: seed=" in output
+    assert "2 of 2 runs complete in run/eval (each run's output: run.log)\n" in output  # no run of their own
+    code, output = program(evaluate.main, *short, "controller=lloyd", f"folder={tmp_path}/there")
+    assert "2 of 2 runs complete in there (each run's output: run.log); python report.py sweep=there\n" in output
 
 
 @pytest.mark.slow
@@ -256,7 +272,10 @@ def test_bad_runs_in_several_batches_are_all_named(program, tmp_path):
     assert code == 1
     assert "3 of the sweep's runs failed" in output
     assert all(f"agent.gamma={value}.0 is out of range" in output for value in (2, 3, 4))
-    assert not list(tmp_path.rglob("run.log"))
+    assert not list(tmp_path.iterdir())  # no run, no folder
+    (tmp_path / "runs" / "smoke").mkdir(parents=True)
+    program(train.main, "-m", *TINY, "agent.gamma=2,3")
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["multirun.yaml"]  # of a folder that was there
 
 
 @pytest.mark.parametrize(

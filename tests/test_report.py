@@ -26,6 +26,7 @@ from agents.report_statistics import (
     ratio,
 )
 from agents.report_tables import find_method, number
+from conf.naming import config_hash
 from envs import SurveillanceConfig
 from envs.centroidal import centroidal_cost
 from tests.synthetic_runs import read, write_run
@@ -35,7 +36,8 @@ from tests.synthetic_runs import read, write_run
 def sweep(tmp_path):
     """Eight seeds of two learned methods and a controller in one world; an outlier separates IQM and mean."""
     for seed, cost in enumerate([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 100.0]):
-        write_run(tmp_path / "sweep" / "deep", seed, cost, "agent=ddpg", events=seed < 2)
+        deep = {"events": seed < 2, "config_hash": "c0ffee00"}
+        write_run(tmp_path / "sweep" / "deep", seed, cost, "agent=ddpg", **deep)
         write_run(tmp_path / "sweep", seed, cost / 10, "safety=none", violations={"collision": 2}, events=False)
         write_run(tmp_path / "sweep", seed, 2.0, controller="coverage_cbf")
     return tmp_path / "sweep"
@@ -373,7 +375,7 @@ def test_only_unfinished_runs(program, tmp_path):
 
 
 def runs_of(folder):
-    return find_runs(folder, lambda config: "hash")
+    return find_runs(folder, config_hash)
 
 
 @pytest.mark.parametrize(
@@ -443,6 +445,43 @@ def test_labels(tmp_path, overrides, kind, world, method):
     (run,) = runs_of(tmp_path)
     assert (run.world, run.method, run.seed, run.finished) == (world, method, 4, False)
     assert run.learned == ("controller" not in kind)
+
+
+def names(folder):
+    return [(run.seed, run.world, run.method) for run in runs_of(folder)]
+
+
+def test_runs_of_one_configuration_are_one_method(program, tmp_path):
+    sweep = tmp_path / "sweep"
+    write_run(sweep, 0, 2.0, controller="lloyd", steps=7)
+    write_run(sweep, 1, 2.0, "video=mp4", controller="lloyd", steps=7, chosen=["default", None, "default"])
+    alike = {"experiment": "smoke", "config_hash": "1234", "events": False}
+    write_run(sweep, 0, 1.0, "experiment=smoke", name="plain", **alike)
+    at_its_default = ("agent.tau=0.01", "env.n_agents=3", "log.gif=False")
+    write_run(sweep, 1, 3.0, "experiment=smoke", *at_its_default, name="spelt_out", **alike)
+    methods = [(0, "default", "lloyd + certified"), (1, "default", "lloyd + certified")]
+    assert names(sweep) == [*methods, (0, "default", "smoke"), (1, "default", "smoke")]
+    code, output = program(report.main, "sweep=sweep", "resamples=100", "reference=null")
+    assert code == 0, output
+    assert "| smoke | 2 | 2 [" in (sweep / "report/report.md").read_text()
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_what_all_trained_methods_share_is_said_once(program, tmp_path):
+    sweep, shared = tmp_path / "sweep", ("collector.num_envs=20", "log.gif=False", "threads=2")
+    write_run(sweep, 0, 1.0, "agent.tau=0.02", *shared, events=False)
+    assert names(sweep) == [(0, "default", "agent.tau=0.02 collector.num_envs=20")]  # one method shares with nobody
+    write_run(sweep, 0, 1.0, "agent=ddpg", *shared, events=False)
+    write_run(sweep, 0, 1.0, *shared, method="dalal", events=False)
+    write_run(sweep, 0, 1.0, *shared, events=False)
+    write_run(sweep, 0, 1.0, "safety.alpha_s=2", controller="lloyd")
+    found = ["agent.tau=0.02", "agent=ddpg", "dalal", "default", "lloyd + certified safety.alpha_s=2"]
+    assert names(sweep) == [(0, "default", name) for name in found]
+    code, output = program(report.main, "sweep=sweep", "resamples=100")
+    assert code == 0, output
+    text = (sweep / "report/report.md").read_text()
+    assert "\nAll trained methods have collector.num_envs=20; their names leave it out.\n" in text
+    assert "log.gif" not in text
 
 
 def fake(method, seed=0, world="default", learned=True):

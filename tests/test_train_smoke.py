@@ -115,18 +115,31 @@ def test_run_folder_tensorboard_and_evaluation(program, tmp_path):
     arguments = (f"run={folder}", "steps=30", "num_envs=3", "pictures=false")
     code, output = program(evaluate.main, *arguments, f"checkpoint={first}", "safety=none")
     assert code == 0, output
-    (other,) = folder.glob("eval/default_30_0_*/eval.json")  # the run's own evaluation is not overwritten
+    (other,) = folder.glob("eval/default_none_30_0_*/eval.json")  # the run's own evaluation is not overwritten
     assert json.loads(other.read_text())["policy"].endswith(first)
     assert json.loads(other.read_text())["safety"]["mode"] == "none"
     assert json.loads((target / "eval.json").read_text()) == result
+    former = other.parent.rename(
+        other.parent.with_name(other.parent.name.replace("none_", ""))
+    )  # before it had the name
+    code, output = program(evaluate.main, *arguments, f"checkpoint={first}", "safety=none", "resume=auto")
+    assert f"{former}/eval.json exists: nothing to do" in output
     code, output = program(evaluate.main, f"run={folder}", "checkpoint=missing.pt")
     assert code == 1
     assert "missing.pt does not exist" in " ".join(output.split())
+    code, output = program(evaluate.main, f"run={folder}/checkpoints/{first}")
+    assert code == 1
+    assert f"run= takes the folder itself: use run={folder} checkpoint={first}." in " ".join(output.split())
 
     files = set(folder.rglob("*"))
     code, output = program(evaluate.main, f"run={folder}", "env.n_agents=5")
     assert code == 1
-    assert "n_agents is 3 there, 5 here" in output
+    text = " ".join(output.split())
+    assert (
+        "n_agents is 3 there, 5 here; n_observation is 18 there, 28 here (stations 6 there, 10 here; others 4 there, 8 here; "
+        in text
+    )
+    assert "A policy fits worlds with the same observation" in text
     assert "Traceback" not in output
     assert set(folder.rglob("*")) == files
 
@@ -154,6 +167,13 @@ def test_controller_evaluation_writes_its_own_folder(program, tmp_path):
     assert code == 0, output
     (result,) = tmp_path.glob("runs/controllers/lloyd_certified_default_10_0_*/eval.json")
     assert json.loads(result.read_text())["robot_steps"] == 60
+
+
+def test_vector_graphics_are_written_without_a_word_of_their_fonts(program, tmp_path):
+    code, output = program(evaluate.main, "controller=lloyd", "steps=3", "num_envs=1", "format=pdf", "video=none")
+    assert code == 0, output
+    assert len(list(tmp_path.glob("runs/controllers/*/*.pdf"))) == 5
+    assert "pruned" not in output
 
 
 def test_a_sweep_of_controllers_writes_under_runs_only(program, tmp_path):
