@@ -104,15 +104,15 @@ def find_runs(sweep: Path, config_hash: Callable[[DictConfig], str]) -> list[Run
 
 
 def _name_alike(runs: list[Run]) -> None:
-    """Give the runs of one configuration the shortest of their worlds' and methods' names: values may be given as overrides that
-    are the defaults.
+    """Give the runs of one configuration the shortest of their worlds' and methods' names, a chosen method's or experiment's
+    first: values may be given as overrides that are the defaults.
     """
     alike = defaultdict(list)
     for run in runs:
         alike[run.config_hash].append(run)
     for group in alike.values():
         world = min((run.world for run in group), key=lambda name: (len(name), name))
-        named = min(group, key=lambda run: (len(run.method), run.method))
+        named = min(group, key=lambda run: (not run.base, len(run.method), run.method))
         for run in group:
             run.world, run.method, run.base, run.settings = world, named.method, named.base, named.settings
 

@@ -23,6 +23,7 @@ from agents.report_runs import ReportError
 from agents.seeds import SeedsFailedError
 from conf.command_line import fail, wants_traceback
 from conf.job_log import FAILED, LOG, JobLog, keep_failure
+from conf.launching import beside_others
 from conf.run_folder import BusyFolderError, finished_program, only_writer
 from conf.schema import check_evaluation, check_training, to_config
 from conf.tuning import go_on
@@ -107,12 +108,6 @@ class ValidateEvaluation(ValidateConfig):
     """The same for evaluate.py, with the run that it names."""
 
     check = staticmethod(check_evaluation)
-
-
-def beside_others(config: DictConfig) -> bool:
-    """Whether a job is one of a sweep whose launcher runs jobs in other processes."""
-    basic = str(config.hydra.launcher._target_).endswith(".BasicLauncher")
-    return config.hydra.mode == RunMode.MULTIRUN and not basic
 
 
 def one_clear_error(main: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:

@@ -28,6 +28,12 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell has it
 ENTRY = {"command_line.py", "sweep.py", "train.py", "evaluate.py", "report.py"}
 
 
+def _wrapped(text: str) -> Iterator[str]:
+    """Lines of the text; paths stay in one piece, to be copied."""
+    for line in textwrap.wrap(text, 110, break_on_hyphens=False, break_long_words=False):
+        yield from [line] if "/" in line else textwrap.wrap(line, 110)
+
+
 def wants_traceback() -> bool:
     """Whether the user asked for Hydra's own errors."""
     return os.environ.get(FULL) == "1"
@@ -36,7 +42,7 @@ def wants_traceback() -> bool:
 def fail(error: BaseException | str) -> None:
     """Print one message of at most 8 lines and leave with exit code 1."""
     text = str(error).splitlines() or [type(error).__name__]
-    lines = [line for part in text for line in textwrap.wrap(part, 110, break_on_hyphens=False)][:7]
+    lines = [line for part in text for line in _wrapped(part)][:7]
     sys.stderr.write("\n".join(["error: " + lines[0], *("  " + line for line in lines[1:])]) + "\n")
     sys.exit(1)
 

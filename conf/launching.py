@@ -12,6 +12,7 @@ from typing import Any
 
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from agents.ray_cluster import reach_ray
@@ -29,6 +30,15 @@ OURS = {"joblib": "local", "submitit_slurm": "slurm", "ray": "ray_local"}
 
 class SweepError(HydraException):
     """A sweep that cannot be started; the message says why and what to do."""
+
+
+def beside_others(config: DictConfig) -> bool:
+    """Whether a job is one of a sweep whose launcher runs jobs in other processes.
+
+    By the launcher's name: Hydra loads its plugins' modules anew, and with them their classes.
+    """
+    basic = str(config.hydra.launcher._target_).endswith(".BasicLauncher")
+    return config.hydra.mode == RunMode.MULTIRUN and not basic
 
 
 def cores() -> int:

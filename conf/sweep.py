@@ -16,7 +16,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus, env_override
 from hydra.plugins.launcher import Launcher
@@ -28,7 +27,7 @@ from tqdm import tqdm
 from agents.interruption import STOP_FILE, InterruptedRunError
 from agents.training_config import seeds_of
 from conf.job_log import LOG, FailedRunError, read_failure
-from conf.launching import SweepError, check_launcher, is_broken_pool, patient, replaced
+from conf.launching import SweepError, beside_others, check_launcher, is_broken_pool, patient, replaced
 from conf.run_folder import finished_run, foreign_run, objective, run_folders
 from conf.sweep_jobs import (
     FAILED_JOBS,
@@ -59,11 +58,7 @@ class SweepLauncher(Launcher):
 
     def __init__(self, inner: Launcher, config: DictConfig, hydra_context: HydraContext) -> None:
         self.inner, self.config, self.hydra_context = inner, config, hydra_context
-        self.basic = isinstance(inner, BasicLauncher)
-        # by name: Hydra loads its plugins' modules anew, and with them their classes
-        self.beside = not str(config.hydra.launcher._target_).endswith(
-            ".BasicLauncher"
-        )  # runs in other processes, with logs
+        self.beside = beside_others(config)
         self.remote = "Slurm" in type(inner).__name__ or "Ray" in type(inner).__name__  # other machines, other devices
         self.stopped: int | None = None
         self.launched: list[Job] = []
@@ -105,9 +100,7 @@ class SweepLauncher(Launcher):
                 job.end(JobStatus.COMPLETED, objective(job.folders))
             else:
                 todo.append(job)
-        if todo and self.basic:
-            self._start(todo, initial_job_idx)
-        elif todo:
+        if todo:
             with self._stop_file(), _progress(todo, tell=self.beside), _importable(), patient(self.inner):
                 self._start_all(todo, initial_job_idx)
         return self._conclude(jobs, first)
