@@ -29,9 +29,9 @@ ENTRY = {"command_line.py", "sweep.py", "train.py", "evaluate.py", "report.py"}
 
 
 def _wrapped(text: str) -> Iterator[str]:
-    """Lines of the text; paths stay in one piece, to be copied."""
+    """Lines of the text; paths stay in one piece, to be copied, unless they are absurd."""
     for line in textwrap.wrap(text, 110, break_on_hyphens=False, break_long_words=False):
-        yield from [line] if "/" in line else textwrap.wrap(line, 110)
+        yield from [line] if "/" in line and len(line) < 256 else textwrap.wrap(line, 110)
 
 
 def wants_traceback() -> bool:
