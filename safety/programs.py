@@ -4,11 +4,7 @@ import torch
 from torch import Tensor
 
 from safety.qp import project_halfspaces_ball, solve_qp
-from safety.speed_faces import face_normals, joint_rows
-
-BALL = 1 - 2.4e-7
-"""The programs' speed limit, share of max_speed: a float32 rounding above every target (:data:`envs.dynamics.FULL_SPEED`), which is
-then within it, and one below max_speed, so that no solution is cut afterwards."""
+from safety.speed_faces import BALL, face_normals, joint_rows
 
 
 def solve_per_robot(

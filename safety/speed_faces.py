@@ -7,6 +7,9 @@ from torch import Tensor
 
 from envs.dynamics import constant, pair_indices
 
+BALL = 1 - 2.4e-7
+"""The programs' speed limit, share of max_speed: a float32 rounding above every target (:data:`envs.dynamics.FULL_SPEED`), which is
+then within it, and one below max_speed, so that no solution is cut afterwards."""
 POLYGON_FACES = 16  # 2-D: a regular polygon
 POLYHEDRON_FACES = 64  # 3-D: a polyhedron with spiral face normals
 
@@ -32,9 +35,9 @@ def speed_faces(dimension: int, radius: float) -> tuple[list[list[float]], float
 
 @constant
 def face_normals(dimension: int, radius: float, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
-    """:func:`speed_faces` with the normals as a tensor ``(F, d)``, made once."""
+    """:func:`speed_faces` of the programs' ball, with the normals as a tensor ``(F, d)``, made once."""
     normals, offset = speed_faces(dimension, radius)
-    return torch.tensor(normals, dtype=dtype, device=device), offset
+    return torch.tensor(normals, dtype=dtype, device=device), offset * BALL
 
 
 def _spiral(n: int) -> Tensor:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.dynamics import FULL_SPEED, integrate, limit_speed, other_indices, pair_indices
-from safety.programs import BALL
+from safety.speed_faces import BALL
 
 DTYPES = (torch.float32, torch.float64)
 

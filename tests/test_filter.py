@@ -15,6 +15,7 @@ from agents.evaluation import evaluate_policy
 from envs import SurveillanceConfig, SurveillanceEnv, keys
 from envs.battery import charging_field
 from safety import QPStatus, SafetyConfig, SafetyFilter
+from safety.programs import solve_jointly
 from safety.speed_faces import speed_faces
 
 torch.set_num_threads(1)
@@ -96,6 +97,20 @@ def test_nothing_is_corrected_at_the_speed_limit_and_no_executed_speed_exceeds_i
     assert (speed <= limit).all()
     assert (speed.double() > SPEED * (1 - 2e-6)).all()
     assert (out["correction"] == 0).all()
+
+
+@pytest.mark.parametrize("solver", ["auto", "pdipm"])
+def test_no_speed_exceeds_the_limit_at_the_corners_of_its_polygon(solver):
+    n = 3
+    angle = torch.arange(32 * n).reshape(32, n) * (2 * math.pi / 32)  # every other one points to a corner
+    none, free = torch.zeros(32, n, n, 2), torch.full((32, n, n), torch.inf)
+    for limit in torch.linspace(0.05, 3, 30).tolist():
+        target = 1.5 * limit * torch.stack([angle.cos(), angle.sin()], dim=-1)
+        value, status, _ = solve_jointly(target, none[:, 0], free[:, 0], none, free, limit, solver)
+        speed = value.norm(dim=-1)
+        assert (status == QPStatus.SOLVED).all()
+        assert (speed <= torch.tensor(limit)).all()
+        assert (speed > 0.98 * limit).all()
 
 
 def test_safe_action_passes_bit_for_bit_through_qpth_per_robot():
