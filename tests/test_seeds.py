@@ -270,6 +270,25 @@ def test_groups_of_seeds(tmp_path):
     assert equally_far({0: tmp_path, 1: tmp_path}, "never", [].append, rows=True) == [(0, {0: tmp_path, 1: tmp_path})]
 
 
+def test_seeds_go_on_from_checkpoints_that_have_their_rows(tmp_path):
+    for seed in (0, 1):
+        folder = tmp_path / str(seed) / "checkpoints"
+        for first, frames in ((0, 100), (100, 200)):
+            content = {"frames": frames, "parts": {"optimizers": {"loss_value": {"state": {}}}}, "ended": False}
+            save_checkpoint(folder / f"frames_{frames:012d}.pt", content | {"replay": {"written": frames, "first": 0}})
+            save_checkpoint(folder / "replay" / f"rows_{first:015d}_{frames:015d}.pt", {"rows": {}})
+    folders: dict[int, Path] = {seed: tmp_path / str(seed) for seed in (0, 1)}
+    said: list[str] = []
+    assert equally_far(folders, "auto", said.append, rows=True) == [(200, folders)]
+    (tmp_path / "1" / "checkpoints" / "replay" / f"rows_{100:015d}_{200:015d}.pt").write_bytes(b"damaged")
+    assert equally_far(folders, "auto", said.append, rows=True) == [(100, folders)]
+    assert "passed over frames_000000000200.pt" in said[0]
+    assert equally_far(folders, "auto", said.append, rows=False) == [(200, folders)]
+    (tmp_path / "1" / "checkpoints" / "replay" / f"rows_{0:015d}_{100:015d}.pt").unlink()
+    # it has none that is whole: its newest says what is missing
+    assert equally_far(folders, "auto", said.append, rows=True) == [(200, folders)]
+
+
 def test_blocks_of_worlds_are_worlds_of_their_own():
     config = SurveillanceConfig(horizon=4, density="gaussian_mixture", density_per_world=True)
     together = SurveillanceEnv(config, 6, seed=[5, 9])
