@@ -8,7 +8,7 @@ it is to rounding.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +32,12 @@ NETWORKS = (
 )
 
 
+def steps_taken(moments: Mapping) -> int:
+    """Steps of an optimiser, by its state of each parameter; the same for all."""
+    first = next(iter(moments.values()), None)
+    return int(first["step"]) if first else 0
+
+
 @dataclass
 class Learner:
     """Networks, losses and optimisers of one seed, or of several stacked."""
@@ -49,8 +55,7 @@ class Learner:
     @property
     def n_updates(self) -> int:
         """Updates so far, as its critics' optimiser counted them when the moments were last shared."""
-        moments = next(iter(self.optimizers["loss_value"].state.values()), None)
-        return int(moments["step"]) if moments else 0
+        return steps_taken(self.optimizers["loss_value"].state)
 
     def gather_moments(self) -> None:
         """Nothing: the optimisers are the learner's own."""

@@ -131,9 +131,8 @@ class MADDPGLoss(DDPGLoss):
         action = actor.module(tensordict[keys.OBSERVATION], layers)
         if not self.filtered:
             return action, 0.0
-        if (
-            action.requires_grad
-        ):  # the filter's gradients lie otherwise: sums over them would depend on the number of learners
+        # the filter's gradients lie otherwise in memory: sums over them would depend on the number of learners
+        if action.requires_grad:
             action.register_hook(torch.Tensor.contiguous)
         state = tensordict.select(keys.POSITION, keys.ENERGY, keys.SLOT).set(keys.NOMINAL_ACTION, action)
         state = safety_filter(state)

@@ -101,10 +101,8 @@ def check_rows(state: dict, source: Path, sound: Callable[[Path], bool] = is_sou
         CheckpointError: if rows are missing or damaged.
     """
     files = {path: rows for path, rows in row_files(source).items() if sound(path)}
-    first = state.get(
-        "first", min((first for first, _ in files.values()), default=0)
-    )  # earlier versions did not save it
-    _chain(source, files, first, state["written"])
+    held = min((first for first, _ in files.values()), default=0)
+    _chain(source, files, state.get("first", held), state["written"])  # earlier versions did not save the first
 
 
 def _chain(source: Path, files: dict[Path, tuple[int, int]], at: int, end: int) -> list[tuple[Path, int, int]]:

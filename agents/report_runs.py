@@ -19,23 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents.evaluation import rollout_steps
+from agents.training_config import NOT_HASHED
 
-# Settings that do not change what is computed by a run of a given seed.
-NOT_HASHED = (
-    "seed",
-    "seeds",
-    "n_seeds",
-    "device",
-    "threads",
-    "deterministic",
-    "resume",
-    "debug",
-    "checkpoint",
-    "log",
-    "hydra",
-    "folder",
-    *("video", "format", "samples"),  # of evaluate.py's pictures
-)
 # Overrides that belong to the world or to no method: they do not name one.
 UNNAMED = {
     *NOT_HASHED,
@@ -138,6 +123,16 @@ def run_folders(sweep: Path) -> Iterable[Path]:
             names[:] = [name for name in names if not re.fullmatch(r"replaced_\d+|\..*", name)]
 
 
+def is_training(config: DictConfig) -> bool:
+    """Whether a composed configuration is train.py's."""
+    return "collector" in config
+
+
+def is_reported(config: DictConfig) -> bool:
+    """Whether a composed configuration is of a run that a report reads: a training, or a controller's evaluation."""
+    return is_training(config) or config.get("controller") is not None
+
+
 def _of_several_seeds(folder: Path) -> bool:
     """Whether the folder is that of a program whose runs have folders of their own."""
     config = OmegaConf.load(folder / ".hydra" / "config.yaml")
@@ -147,9 +142,9 @@ def _of_several_seeds(folder: Path) -> bool:
 def read_run(folder: Path, sweep: Path, config_hash: Callable[[DictConfig], str]) -> Run | None:
     """The run in ``folder``; None if another program wrote it, or if it evaluates a trained run."""
     config: Any = OmegaConf.load(folder / ".hydra" / "config.yaml")
-    learned = "collector" in config
-    if not learned and config.get("controller") is None:
+    if not is_reported(config):
         return None
+    learned = is_training(config)
     hydra = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra
     choices, overrides = hydra.runtime.choices, [str(entry).lstrip("+~") for entry in hydra.overrides.task]
     steps = (config.eval.steps if learned else config.steps) or rollout_steps(config.env.horizon)

@@ -16,6 +16,23 @@ from safety import SafetyConfig
 
 DEVICES = ("auto", "cpu", "cuda")
 MOST_SEEDS = 1000
+NOT_HASHED = (
+    *(
+        "seed",
+        "seeds",
+        "n_seeds",
+        "device",
+        "threads",
+        "deterministic",
+        "resume",
+        "debug",
+        "checkpoint",
+        "log",
+        "hydra",
+    ),
+    *("folder", "video", "format", "samples"),  # of evaluate.py's pictures and report.py
+)
+"""Settings that do not change what is computed by a run of a given seed."""
 
 
 @dataclass

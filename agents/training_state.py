@@ -5,7 +5,7 @@ streams, the configuration and, through :mod:`agents.replay_files`, the replay b
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from agents.checkpoint import (
     save_checkpoint,
     set_aside,
 )
+from agents.learners import steps_taken
 from agents.replay import ReplayOfLearner
 from agents.replay_files import ReplayFiles, check_rows
 
@@ -121,9 +122,8 @@ class TrainingState:
                 found = named_checkpoint(path, tell, rows=rows)
         if found is None:
             if target := set_aside(self.folder.parent):
-                tell(
-                    f"starting anew ({'resume=never' if resume == 'never' else 'no checkpoint'}): what was there is in {target}."
-                )
+                reason = "resume=never" if resume == "never" else "no checkpoint"
+                tell(f"starting anew ({reason}): what was there is in {target}.")
             return True
         path, content = found
         own = path.parent.resolve() == self.folder.resolve()
@@ -167,6 +167,22 @@ def newest_valid(
         CheckpointError: if only replay rows are missing, of all that there are.
     """
     without_rows: CheckpointError | None = None
+    for path, content, error in _readable(folder, tell, latest, rows=rows):
+        if error is None:
+            return path, content
+        without_rows = without_rows or error
+    if without_rows is not None:
+        raise without_rows
+    return None
+
+
+def _readable(
+    folder: Path, tell: Callable[[str], None], latest: int | None = None, *, rows: bool
+) -> Iterator[tuple[Path, dict, CheckpointError | None]]:
+    """Checkpoints that can be read, newest first, each with its content and with what is wrong with its replay rows.
+
+    Arguments as :func:`newest_valid`.
+    """
     sound = functools.cache(is_sound)
     for path in reversed(checkpoints(folder)):
         if latest is not None and frames_of(path) > latest:
@@ -176,16 +192,14 @@ def newest_valid(
         except CheckpointError as error:
             tell(f"passed over: {error}")
             continue
+        missing = None
         try:
             if rows:
                 check_rows_of(path, content, sound)
-            return path, content
         except CheckpointError as error:
-            without_rows = without_rows or error
             tell(f"passed over {path.name}: {error}")
-    if without_rows is not None:
-        raise without_rows
-    return None
+            missing = error
+        yield path, content, missing
 
 
 def check_rows_of(path: Path, content: dict, sound: Callable[[Path], bool] = is_sound) -> None:
@@ -203,23 +217,11 @@ def valid_ages(folder: Path, tell: Callable[[str], None], *, rows: bool) -> set[
 
     Those whose replay ``rows`` are not there are left out, if they are needed and others have theirs.
     """
-    ages, complete, sound = set(), set(), functools.cache(is_sound)
-    for path in checkpoints(folder):
-        try:
-            content = load_resumable(path)
-        except CheckpointError as error:
-            tell(f"passed over: {error}")
-            continue
-        moments = content["parts"]["optimizers"]["loss_value"]["state"]
-        age = (content["frames"], int(next(iter(moments.values()))["step"]) if moments else 0)
-        ages.add(age)
-        try:
-            if rows:
-                check_rows_of(path, content, sound)
-            complete.add(age)
-        except CheckpointError as error:
-            tell(f"passed over {path.name}: {error}")
-    return complete or ages
+    found = [
+        ((content["frames"], steps_taken(content["parts"]["optimizers"]["loss_value"]["state"])), error)
+        for _, content, error in _readable(folder, tell, rows=rows)
+    ]
+    return {age for age, error in found if error is None} or {age for age, _ in found}
 
 
 def named_checkpoint(path: Path, tell: Callable[[str], None], *, rows: bool) -> tuple[Path, dict]:

@@ -151,9 +151,8 @@ def describe(error: BaseException, schema: type) -> str:
         key = getattr(cause, "full_key", None) or override.split("=")[0].lstrip("+~")
         return f"{override}: {why}.\n{explain(schema, str(key).split('[')[0])}"
     if match := re.match(r"Could not (?:override|append to config|delete from config)\.? ?'?([^'\s]*)", text):
-        key = max(
-            match.group(1), str(getattr(cause, "full_key", None) or ""), key=len
-        )  # the cause may name its group only
+        # the cause may name its group only
+        key = max(match.group(1), str(getattr(cause, "full_key", None) or ""), key=len)
         return f"{why.rstrip('.')}.\n{explain(schema, key)} python <program> --help lists all options."
     if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
         key = str(getattr(cause or error, "full_key", None) or "hydra")

@@ -8,8 +8,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from agents.evaluation import rollout_steps
-from agents.report_runs import NOT_HASHED
-from agents.training_config import seeds_of
+from agents.training_config import NOT_HASHED, seeds_of
 
 COMPUTED = ("fixed_sizes", "cuda_graphs")
 """How a run computes, where not as by default."""
@@ -17,7 +16,7 @@ GROUPS = ("method", "env", "safety", "agent", "train", "experiment")
 
 
 def config_hash(cfg: DictConfig) -> str:
-    """First 8 hex digits of a digest of the resolved configuration without :data:`agents.report_runs.NOT_HASHED`."""
+    """First 8 hex digits of a digest of the resolved configuration without :data:`agents.training_config.NOT_HASHED`."""
     return hashlib.sha256(json.dumps(hashed_config(cfg), sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -92,7 +92,7 @@ def finished_evaluation(path: Path, asked: dict) -> str | None:
     content = json.loads(path.read_text())
     if any(content.get(name) != value for name, value in asked.items()):
         return None
-    return f"{path} exists: nothing to do. {_other_code(path, 'was made')}resume=never evaluates anew."
+    return f"{path} exists: nothing to do. {_other_code(content, 'was made')}resume=never evaluates anew."
 
 
 def finished_program(cfg: DictConfig) -> str | None:
@@ -115,13 +115,13 @@ def finished_run(folder: Path, resume: str | None) -> str | None:
         return None
     if folder.resolve() in (Path(resume).resolve(), *Path(resume).resolve().parents):  # one of its own checkpoints
         return None
-    code = _other_code(folder / "summary.json", "was trained")
+    code = _other_code(json.loads((folder / "summary.json").read_text()), "was trained")
     return f"{folder} holds a finished run: nothing to do. {code}resume=never trains it anew."
 
 
-def _other_code(path: Path, what: str) -> str:
-    """A sentence if the results in a JSON file are of another commit than this one's; an empty string otherwise."""
-    there, here = json.loads(path.read_text()).get("git_hash"), git_hash()
+def _other_code(content: dict, what: str) -> str:
+    """A sentence if results are of another commit than this one's; an empty string otherwise."""
+    there, here = content.get("git_hash"), git_hash()
     return f"It {what} by the code of {there}, this is {here}. " if there not in (None, here) else ""
 
 

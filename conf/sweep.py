@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from agents.interruption import STOP_FILE, InterruptedRunError
+from agents.report_runs import is_reported, is_training
 from agents.training_config import seeds_of
 from conf.job_log import LOG, FailedRunError, read_failure
 from conf.launching import SweepError, beside_others, check_launcher, is_broken_pool, patient, replaced
@@ -120,8 +121,7 @@ class SweepLauncher(Launcher):
         config = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
         with open_dict(config):
             config.hydra.job.num, config.hydra.job.id = number, str(number)
-        read = "collector" in config or config.get("controller") is not None
-        job = Job(list(overrides), Path(), reported=read)
+        job = Job(list(overrides), Path(), reported=is_reported(config))
         try:
             job.folder = Path(str(config.hydra.sweep.dir), str(config.hydra.sweep.subdir)).absolute()
             if self.remote and "device" in config:
@@ -133,7 +133,7 @@ class SweepLauncher(Launcher):
             job.error = error
             return job
         job.folders = [job.folder]
-        if "collector" in config:  # training
+        if is_training(config):
             own = run_folders(config, seeds_of(config), job.folder)
             for seed, folder in own.items():
                 if message := foreign_run(folder, config, seed):
